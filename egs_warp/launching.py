@@ -191,14 +191,14 @@ class _LaunchCache(threading.local):
     """Recorded launches of this thread, which are updated and repeated."""
 
     def __init__(self) -> None:
-        self.launches: dict[tuple[Any, str], tuple[Any, int | tuple[int, int], list[Any]]] = {}
+        self.launches: dict[tuple[Any, str], tuple[Any, int | tuple[int, ...], list[Any]]] = {}
 
 
 _launch_cache = _LaunchCache()
 
 
 def launch_cached(
-    kernel: Any, dim: int | tuple[int, int], *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device
+    kernel: Any, dim: int | tuple[int, ...], *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device
 ) -> None:
     """Launch a kernel at a third of the cost of ``wp.launch``, for kernels that run many times a second.
 
@@ -420,14 +420,15 @@ class PinnedMirror:
     """
 
     def __init__(self, array: wp.array) -> None:
-        self._array, self._device, self._host = array, device_of(array), array
+        self.array, self._device, self._host = array, device_of(array), array
         if not self._device.is_cpu:
             self._host = wp.zeros(array.shape, array.dtype, "cpu", pinned=True)
         self._values = self._host.numpy()
         self._sent: wp.Event | None = None
 
     def put(self, values: np.ndarray) -> None:
-        """Upload ``values`` of the same shape. Nothing else may write to the array."""
+        """Upload ``values`` of the same size. Nothing else may write to the array."""
+        values = values.reshape(self._values.shape)
         if self._sent is not None:
             if np.array_equal(values, self._values):
                 return
@@ -435,7 +436,7 @@ class PinnedMirror:
             wp.synchronize_event(self._sent)
         np.copyto(self._values, values)
         if not self._device.is_cpu:
-            wp.copy(self._array, self._host)
+            wp.copy(self.array, self._host)
             self._sent = wp.get_stream(self._device).record_event(self._sent)
 
     def get(self) -> np.ndarray:
@@ -448,7 +449,7 @@ class PinnedMirror:
         device = mirrors[0]._device
         if not device.is_cpu:
             for mirror in mirrors:
-                wp.copy(mirror._host, mirror._array)
+                wp.copy(mirror._host, mirror.array)
             wp.synchronize_stream(device)
         return [mirror._values.copy() for mirror in mirrors]
 

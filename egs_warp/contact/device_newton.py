@@ -20,8 +20,9 @@ from egs_warp.contact.device_step import SolveEnd, StepWorkspace
 from egs_warp.contact.newton import ContactLinearization, NewtonStepResult, PenetrationCheck
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.body import SoftBody
-from egs_warp.fem.dense_cholesky import DenseCholesky
+from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.step_problem import Tangent
+from egs_warp.fem.tiled_cholesky import TiledCholesky
 from egs_warp.kernels.contact.newton_convergence import OUTCOME, REPEAT
 from egs_warp.launching import round_up
 from egs_warp.muscles.muscle_set import MuscleSet
@@ -37,7 +38,7 @@ class DeviceContactLinearizer(StepWorkspace):
     """
 
     def __init__(
-        self, factors: DenseCholesky, body: SoftBody, muscles: MuscleSet, selector: DeviceContactSelector
+        self, factors: TiledCholesky, body: SoftBody, muscles: MuscleSet, selector: DeviceContactSelector
     ) -> None:
         super().__init__(factors, body, muscles, selector)
         self._workspaces: dict[int, NewtonWorkspace] = {}
@@ -304,7 +305,7 @@ class DeviceNewtonIterate:
                 progress.begin(self._residual_norm)
             workspace.start_newton(problem, shift, friction, progress, base=base)
         readback = workspace.wait_newton()
-        if self._tangent_pending and not owner.factors.is_ready:
+        if self._tangent_pending and owner.factors.status is not FactorStatus.DEFINITE:
             workspace.base_iterate = workspace.trial_iterate = workspace.pending_iterate = None
             self._wait_tangent()
             return self.newton_steps(shift, friction, progress)
@@ -381,7 +382,7 @@ class DeviceNewtonIterate:
             return
         self._tangent_pending = False
         owner, old = self.linearization.owner, self.linearization
-        if owner.factors.is_ready:
+        if owner.factors.status is FactorStatus.DEFINITE:
             return
         problem = old.tangent.problem
         self._linearization = owner(problem.tangent(owner.factors, self.velocities, self.tension), old.contacts)

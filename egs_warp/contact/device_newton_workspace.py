@@ -88,7 +88,6 @@ class NewtonWorkspace:
         self.columns = owner.zeros(size, width)
         self._right, self.delassus = owner.zeros(size, 3 + width), owner.zeros(width, width)
         self._host_delassus = owner.stream.pinned(width * width)
-        self._momentum_matrices = owner.zeros(2, 3, 3)
         # The input and the read-back of a trial are one transfer each.
         self._trial_upload = PinnedUpload(owner.stream, 3 + width)
         self.trial_input, self.target_forces = self._trial_upload.device.split([3, width])
@@ -122,10 +121,8 @@ class NewtonWorkspace:
         """
         self._tensions = as_warp(self.tensions, real)
         self._base, self._trial = owner.zeros(3 * size + width), owner.zeros(3 * size + width)
-        self.end_positions, self._gradient, self._residual, self._solved, self._force_velocities, self._half_solved = (
-            owner.zeros(6, size)
-        )
-        self._torque, self._rotation = owner.zeros(2, 3)
+        self.end_positions, self._gradient, self._residual, self._force_velocities = owner.zeros(4, size)
+        self._torque = owner.zeros(3)
         self._graphs = GraphCache(owner.stream)
         self.base_iterate: Any = None
         self.trial_iterate: Any = None
@@ -138,12 +135,6 @@ class NewtonWorkspace:
     def trial_parts(self) -> Any:
         """Return the ``parts`` of the last trial."""
         return self.parts(self._trial)
-
-    def apply_inverse(self, impulses: torch.Tensor) -> torch.Tensor:
-        """Return (3N, j) m/s, J^-1 times ``impulses`` (3N, j) in N s, with the current momentum projection."""
-        owner = self.owner
-        solved = owner.factors.inverse.T @ (owner.factors.inverse @ impulses)
-        return solved.addmm_(owner.rotation_response, owner.momentum_projection @ impulses)
 
     def contact_velocities(self, velocities: torch.Tensor) -> torch.Tensor:
         """Return (3K, j) m/s, W v for nodal ``velocities`` v (3N, j)."""
@@ -212,7 +203,7 @@ class NewtonWorkspace:
 
     def enqueue_linearization(self, dt: float, ratio: float) -> None:
         """Compute the columns, the Delassus operator and the momentum projection. ``ratio`` is 1 + dt drag."""
-        owner, inverse = self.owner, self.owner.factors.inverse
+        owner, factors = self.owner, self.owner.factors
         self._indices.copy_(self._packed_indices)
         momenta, impulses = self._right[:, :3], self._right[:, 3:]
         torch.mul(owner.rotation_modes, owner.masses.repeat_interleave(3)[:, None], out=momenta)
@@ -224,33 +215,12 @@ class NewtonWorkspace:
             [as_warp(impulses[None], real)],
         )
         impulses.mul_(dt)
-        solved = inverse.T @ (inverse @ self._right)
-        self._enqueue_momentum_projection(momenta, solved[:, :3], ratio)
-        torch.addmm(solved[:, 3:], owner.rotation_response, owner.momentum_projection @ impulses, out=self.columns)
+        solved = factors.enqueue_solve(self._right)
+        factors.enqueue_momentum_projection(owner.rotation_modes, momenta, solved[:, :3], ratio)
+        torch.addmm(solved[:, 3:], factors.rotation_response, factors.rotation_operator @ impulses, out=self.columns)
         self._enqueue_contact_velocities(self.columns, self.delassus)
         self.coulomb.enqueue_operator(self.delassus)
         self._host_delassus.copy_(self.delassus.view(-1), non_blocking=True)
-
-    def _enqueue_momentum_projection(
-        self, momenta: torch.Tensor, rotation_response: torch.Tensor, ratio: float
-    ) -> None:
-        """Compute the momentum projection from the ``momenta`` M T (3N, 3) of the rigid rotations T and
-        ``rotation_response``, J^-1 M T.
-        """
-        owner = self.owner
-        owner.rotation_response.copy_(rotation_response)
-        torch.mm(momenta.T, owner.rotation_response, out=self._momentum_matrices[0])
-        self._launch(
-            kernels.invert_momentum_matrix_kernel,
-            1,
-            [ratio, as_warp(self._momentum_matrices[:1], Mat33)],
-            [as_warp(self._momentum_matrices[1:], Mat33)],
-        )
-        torch.mm(
-            self._momentum_matrices[1],
-            owner.rotation_modes.T - ratio * owner.rotation_response.T,
-            out=owner.momentum_projection,
-        )
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self._device)
@@ -414,7 +384,7 @@ class NewtonWorkspace:
     ) -> None:
         """Queue a new tangent, with its factors and linearisation, asynchronously.
 
-        The result is valid only if ``factors.is_ready`` is True after synchronisation.
+        The result is valid only if ``factors.status`` is ``DEFINITE`` after synchronisation.
 
         Args:
             problem: the step.
@@ -485,18 +455,16 @@ class NewtonWorkspace:
             residual: (3N,) N s.
             end: (3N,) m/s, overwritten with the result.
         """
-        owner, inverse = self.owner, self.owner.factors.inverse
-        torch.mv(inverse, residual, out=self._half_solved)
-        torch.mv(inverse.T, self._half_solved, out=self._solved)
-        torch.mv(owner.momentum_projection, residual, out=self._rotation)
+        factors = self.owner.factors
+        solved, rotation = factors.enqueue_vector_solve(residual)
         self._launch(
             kernels.free_velocity_kernel,
             self._node_count,
             [
-                as_warp(owner.rotation_response, real),
+                as_warp(factors.rotation_response, real),
                 vectors(velocities),
-                vectors(self._solved),
-                as_warp(self._rotation, real),
+                vectors(solved),
+                as_warp(rotation, real),
             ],
             [vectors(end)],
         )
@@ -508,11 +476,11 @@ class NewtonWorkspace:
 
     def enqueue_prediction(self, dt: float, ratio: float) -> None:
         """Queue ``predict_velocities`` from the trial in ``trial_input``. ``ratio`` is 1 + dt drag."""
-        owner, inverse = self.owner, self.owner.factors.inverse
+        owner, factors = self.owner, self.owner.factors
         self._indices.copy_(self._packed_indices)
         momenta = self._right[:, :3]
         torch.mul(owner.rotation_modes, owner.masses.repeat_interleave(3)[:, None], out=momenta)
-        self._enqueue_momentum_projection(momenta, inverse.T @ (inverse @ momenta), ratio)
+        factors.enqueue_momentum_projection(owner.rotation_modes, momenta, factors.enqueue_solve(momenta), ratio)
         self.enqueue_residual(dt, ratio)
         velocities, free_velocities, _, _ = self.trial_parts()
         self._enqueue_free_velocities(velocities, self._residual, free_velocities)

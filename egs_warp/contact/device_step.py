@@ -1,6 +1,6 @@
-"""Start and matrix of a body's step on a GPU: buffers, factorisation, momentum projection and prefetch of contacts.
+"""Start and matrix of a body's step on a GPU: buffers, factorisation and prefetch of contacts.
 
-The kernel is in ``kernels/contact/step_start.py``. ``DeviceContactLinearizer`` in ``device_newton`` adds the
+The kernel is in ``kernels/fem/step_start.py``. ``DeviceContactLinearizer`` in ``device_newton`` adds the
 linearisations to ``StepWorkspace``.
 """
 
@@ -18,10 +18,10 @@ from egs_warp.contact.device_selection import DeviceContactSelector
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
-from egs_warp.fem.dense_cholesky import DenseCholesky
 from egs_warp.fem.step_problem import MIN_RELATIVE_STIFFNESS, StepProblem
+from egs_warp.fem.tiled_cholesky import TiledCholesky
 from egs_warp.fem.warp_elasticity import WarpElasticity
-from egs_warp.kernels.contact import step_start as kernels
+from egs_warp.kernels.fem import step_start as kernels
 from egs_warp.launching import round_up
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy
@@ -58,17 +58,13 @@ class StepWorkspace:
     """
 
     def __init__(
-        self, factors: DenseCholesky, body: SoftBody, muscles: MuscleSet, selector: DeviceContactSelector
+        self, factors: TiledCholesky, body: SoftBody, muscles: MuscleSet, selector: DeviceContactSelector
     ) -> None:
         self.factors, self.body, self.stream, self.selector = factors, body, factors.stream, selector
         elements = body.assembly.elements
         assert isinstance(elements, WarpElasticity)
         self.elements = elements
         size = 3 * len(body.mesh.nodes)
-        self.rotation_response, self.momentum_projection = self.zeros(size, 3), self.zeros(3, size)
-        """(3N, 3) and (3, 3N). ``rotation_response`` times ``momentum_projection`` times a right-hand side is the
-        correction added to its solution.
-        """
         self.masses = self.tensor(body.node_mass)
         self._start_upload = PinnedUpload(self.stream, 2 * size)
         self.positions, self.velocities = self._start_upload.device.split(size)
@@ -80,9 +76,8 @@ class StepWorkspace:
         self._ends = vectors(self.positions), vectors(self.ballistic)
         self._gravity = self.tensor(np.tile(body.gravity, len(body.mesh.nodes)))
         self._graphs = GraphCache(self.stream)
-        self.no_tensions = wp.zeros(0, dtype=real, device=body.assembly.device)
         self.gradients = wp.zeros(len(body.mesh.tets), dtype=Mat33, device=body.assembly.device)
-        self.muscle_segments = elements.muscle_segments(MuscleEnergy.of(muscles, np.zeros(muscles.segment_count)))
+        self.muscle_segments = elements.segments(muscles.difference_rows, muscles.rest_lengths)
         self.segment_count = muscles.segment_count
         self._rows = self.tensor(self.muscle_segments.rows.toarray())
         self._directions_upload = PinnedUpload(self.stream, 4 * (3 * self.segment_count + 2 * _CAPACITY_STEP))
@@ -126,13 +121,13 @@ class StepWorkspace:
         lanes = 1 if device.is_cpu else kernels.BLOCK
         wp.launch(
             kernels.step_start_kernel,
-            lanes,
-            inputs=[dt, as_warp(self.masses, real), vectors(self.positions), vectors(self.velocities)],
+            (1, lanes),
+            inputs=[dt, as_warp(self.masses, real), *map(_one_world, (self.positions, self.velocities))],
             outputs=[
-                vectors(self.lever_arms),
-                as_warp(self.rotation_modes, real),
+                _one_world(self.lever_arms),
+                as_warp(self.rotation_modes[None], real),
                 as_warp(self.inverse_inertia, Mat33),
-                vectors(self.rigid_guess),
+                _one_world(self.rigid_guess),
             ],
             device=device,
             block_dim=lanes,
@@ -193,7 +188,7 @@ class StepWorkspace:
     def enqueue_factors(self, ends: wp.array, dt: float) -> None:
         """Factor the matrix of the step at the positions ``ends``, without muscles."""
         entries = self.elements.enqueue_entries(ends, self.gradients, dt, factor=dt**2, projected=False)
-        self.factors.enqueue(wp.to_torch(entries))
+        self.factors.enqueue_factor(wp.to_torch(entries)[0])
 
     def enqueue_stiffness(self, problem: StepProblem, tension: MuscleEnergy, velocities: np.ndarray) -> None:
         """Add the stiffness of the muscles under ``tension``, at the end positions that ``velocities`` (N, 3) lead to,
@@ -225,9 +220,14 @@ class StepWorkspace:
 
     def enqueue_gradient(self, ends: wp.array, dt: float, tensions: wp.array, gradient: wp.array) -> None:
         """Compute the internal ``gradient`` in newtons at the positions ``ends``, under the muscles' ``tensions``."""
-        self.elements.enqueue_gradient(ends, self.gradients, dt, self.muscle_segments, tensions, gradient)
+        self.elements.enqueue_gradient(ends, self.gradients, dt, self.muscle_segments, gradient, tensions)
 
 
 def vectors(flat: torch.Tensor) -> wp.array:
     """View a ``flat`` tensor (3N,) as a Warp array of N vectors."""
     return as_warp(flat.view(-1, 3), Vec3)
+
+
+def _one_world(flat: torch.Tensor) -> wp.array:
+    """View a ``flat`` tensor (3N,) as a Warp array (1, N) of vectors."""
+    return as_warp(flat.view(1, -1, 3), Vec3)

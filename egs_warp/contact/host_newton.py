@@ -119,7 +119,8 @@ class HostNewtonWorkspace:
             The state there, and the norm of the residual divided by dt x weight.
         """
         self._load(problem)
-        elements = problem.body.assembly.elements
+        assembly = problem.body.assembly
+        elements, segments = assembly.elements, assembly.load_segments(tension)
         assert isinstance(elements, SimdElasticity)
         columns, target_forces, length = 0, base.forces_at, 0.0
         end = base
@@ -130,7 +131,12 @@ class HostNewtonWorkspace:
             kernels.trial_kernel,
             1,
             inputs=[
-                *(elements.elements, elements.lines_of(tension), self._step, problem.damping.start),
+                *(
+                    elements.elements,
+                    elements.struct_of(segments),
+                    self._step,
+                    problem.damping.start,
+                ),
                 *(problem.dt, 1.0 + problem.dt * problem.drag, *self._contacts_of(base.contacts), columns),
                 *(base.velocities_at, base.free_velocities_at, base.forces_at, target_forces, float(length)),
             ],

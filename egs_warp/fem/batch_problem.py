@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
+import warp as wp
 
-from egs_warp.fem.batch_elasticity import BatchElasticity
-from egs_warp.fem.batch_factors import CHUNK_BYTES, PANEL, BatchCholesky
-from egs_warp.fem.batched import BatchedRecord, nonzero
+from egs_warp.fem.batched import BatchedRecord, as_warp, launch_on, nonzero
 from egs_warp.fem.body import SoftBody
+from egs_warp.fem.linear_solver import FactorStatus
+from egs_warp.fem.momentum_projection import MomentumProjection
+from egs_warp.fem.panel_cholesky import CHUNK_BYTES, PANEL, PanelCholesky
 from egs_warp.fem.step_problem import MIN_RELATIVE_STIFFNESS
+from egs_warp.fem.warp_elasticity import MuscleSegmentMaps, WarpElasticity
+from egs_warp.kernels.fem import step_start as kernels
 from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.muscles.tension import force_length_factor
+from egs_warp.precision import Mat33, Vec3, real
+
+_MIN_LENGTH = 1e-300
+"""Lower bound of segment lengths, m; it gives a segment whose ends coincide the direction 0."""
 
 
 class BatchBody:
@@ -33,20 +43,59 @@ class BatchBody:
             body: the body, on the device of the batch.
             muscles: its muscles.
             count: maximum number of worlds.
-            panel: as in ``BatchCholesky``.
-            chunk_bytes: as in ``BatchCholesky``.
+            panel: as in ``PanelCholesky``.
+            chunk_bytes: as in ``PanelCholesky``.
         """
-        self.body = body
-        self.device = torch.device(str(body.assembly.device))
-        size = 3 * len(body.mesh.nodes)
-        self.factors = BatchCholesky(count, size, self.device, panel=panel, chunk_bytes=chunk_bytes)
-        self.elasticity = BatchElasticity(body.assembly, muscles, count, matrices=min(count, self.factors.chunk))
+        self.body, assembly = body, body.assembly
+        self.device = torch.device(str(assembly.device))
+        self.factors = PanelCholesky(assembly.upper_pattern, count, self.device, panel=panel, chunk_bytes=chunk_bytes)
+        matrices = min(count, self.factors.chunk)
+        self.elements = WarpElasticity(
+            assembly.maps, assembly.material, assembly.device, worlds=count, matrices=matrices
+        )
+        self.segments = MuscleSegmentMaps(muscles.difference_rows, muscles.rest_lengths, assembly.device, worlds=count)
         self.mass = torch.as_tensor(body.node_mass, device=self.device)
-        self.gravity = torch.as_tensor(np.asarray(body.gravity, dtype=np.float64), device=self.device)
+        self.gravity, self._difference_rows, self._rest_lengths = (
+            torch.as_tensor(np.asarray(values, dtype=np.float64), device=self.device)
+            for values in (body.gravity, muscles.difference_rows.toarray(), muscles.rest_lengths)
+        )
 
     def centre(self, values: torch.Tensor) -> torch.Tensor:
         """Return the mass-weighted mean (c, 1, 3) of nodal ``values`` (c, N, 3)."""
         return (self.mass[:, None] * values).sum(dim=1, keepdim=True) / self.body.mass
+
+    def add_muscle_stiffness(
+        self, matrices: torch.Tensor, positions: torch.Tensor, tensions: torch.Tensor, factor: float
+    ) -> None:
+        """Add ``factor`` times the Hessian of the muscle energy to the lower triangles of ``matrices``.
+
+        Stiffnesses of at most ``MIN_RELATIVE_STIFFNESS`` times the largest of the same world are dropped, as in
+        ``TensionHessian.rank_one_terms``.
+
+        Args:
+            matrices: (c, 3N, 3N) kg, modified in place.
+            positions: (c, N, 3) m.
+            tensions: (c, M) N, muscle tensions.
+            factor: s^2, multiplies the Hessian.
+        """
+        rows, rest_lengths = self._difference_rows, self._rest_lengths
+        vectors = rows @ positions
+        lengths = vectors.norm(dim=2).clamp(min=_MIN_LENGTH)
+        directions = vectors / lengths[:, :, None]
+        share, _, slope = force_length_factor(lengths / rest_lengths)
+        across, stretch = tensions * share / lengths, tensions * slope / rest_lengths
+        largest = torch.maximum(across.abs(), stretch.abs()).amax(dim=1, keepdim=True).clamp(min=_MIN_LENGTH)
+        across, stretch = (
+            torch.where(rate.abs() > MIN_RELATIVE_STIFFNESS * largest, rate, 0.0) for rate in (across, stretch)
+        )
+        blocks = matrices.view(len(matrices), len(self.mass), 3, len(self.mass), 3)
+        for i in range(3):
+            for k in range(i + 1):
+                rates = (stretch - across) * directions[:, :, i] * directions[:, :, k] + (across if i == k else 0.0)
+                part = rows.T @ (factor * rates[:, :, None] * rows)
+                blocks[:, :, i, :, k] += part
+                if i != k:
+                    blocks[:, :, k, :, i] += part
 
 
 @dataclass(frozen=True)
@@ -69,8 +118,9 @@ class BatchProblem(BatchedRecord):
     rotation_modes: torch.Tensor
     """(c, 3N, 3) m, nodal velocities e_k x r of unit rotations about the centre of mass."""
     inverse_inertia: torch.Tensor
-    """(c, 3, 3) 1/(kg m^2), inverse inertia; not finite for a world whose inertia is singular, because an exception
-    would stop all worlds."""
+    """(c, 3, 3) 1/(kg m^2), inverse inertia."""
+    rigid_guess: torch.Tensor
+    """(c, N, 3) m/s, rigid motion with the momenta of the state, the initial guess of the solver."""
 
     @classmethod
     def at(
@@ -93,16 +143,21 @@ class BatchProblem(BatchedRecord):
             dt: step size, s.
             drag: alpha of the Rayleigh damping, 1/s.
         """
-        arms = positions - common.centre(positions)
-        modes = arms.new_zeros((*arms.shape, 3))
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            modes[:, :, i, k], modes[:, :, j, k] = -arms[:, :, j], arms[:, :, i]
-        modes = modes.flatten(1, 2)
-        inertia = (modes * common.mass.repeat_interleave(3)[:, None]).mT @ modes
-        gradients = common.elasticity.deformation_gradients(positions)
-        inverse = torch.linalg.inv_ex(inertia).inverse
-        return cls(common, dt, drag, slots, positions, velocities, gradients, modes, inverse)
+        modes = positions.new_empty(len(positions), 3 * len(common.mass), 3)
+        inverse_inertia = positions.new_empty(len(positions), 3, 3)
+        arms, guess = torch.empty_like(positions), torch.empty_like(positions)
+        lanes = 1 if common.elements.device.is_cpu else kernels.BLOCK
+        launch_on(
+            common.device,
+            kernels.step_start_kernel,
+            (len(positions), lanes),
+            inputs=[dt, (common.mass, real), (positions, Vec3), (velocities, Vec3)],
+            outputs=[(arms, Vec3), (modes, real), (inverse_inertia, Mat33), (guess, Vec3)],
+            block_dim=lanes,
+        )
+        gradients = positions.new_empty(len(positions), len(common.body.mesh.tets), 3, 3)
+        common.elements.enqueue_start(as_warp(positions, Vec3), as_warp(gradients, Mat33))
+        return cls(common, dt, drag, slots, positions, velocities, gradients, modes, inverse_inertia, guess)
 
     @property
     def momenta(self) -> torch.Tensor:
@@ -125,19 +180,17 @@ class BatchProblem(BatchedRecord):
 
     def is_inversion_free(self, velocities: torch.Tensor) -> torch.Tensor:
         """Return, for each world, True if no element is inverted at the end positions of ``velocities``: (c,) bool."""
-        return self.body.elasticity.is_inversion_free(self.end_positions(velocities))
-
-    def rigid_guess(self) -> torch.Tensor:
-        """Return the rigid motion (c, N, 3) m/s with the momenta of the state, the initial guess of the solver."""
-        arms = self.positions - self.body.centre(self.positions)
-        spin = (self.inverse_inertia @ (self.momenta @ self.velocities.flatten(1)[:, :, None]))[:, :, 0]
-        rotated = _rotate(self.dt * spin, arms)
-        return self.body.centre(self.velocities) + (rotated - arms) / self.dt
+        _, determinants = self.body.elements.enqueue_energies(as_warp(self.end_positions(velocities), Vec3), None, 0.0)
+        return wp.to_torch(determinants)[: len(velocities)].amin(dim=1) > 0.0
 
     def internal_gradient(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
         """Return minus the internal forces (c, N, 3) N at the end of the step, with muscle ``tensions`` (c, M) N."""
-        end = self.end_positions(velocities)
-        return self.body.elasticity.gradient(end, self.start_gradients, self.dt, tensions)
+        gradient, body = torch.empty_like(velocities), self.body
+        segments, loads = (None, None) if tensions is None else (body.segments, as_warp(tensions, real))
+        end = as_warp(self.end_positions(velocities), Vec3)
+        start = as_warp(self.start_gradients, Mat33)
+        body.elements.enqueue_gradient(end, start, self.dt, segments, as_warp(gradient, Vec3), loads)
+        return gradient
 
     def momentum_correction(self, internal_gradient: torch.Tensor) -> torch.Tensor:
         """Return the angular velocity (c, 3) rad/s that the projection P^T restores (``StepProblem``)."""
@@ -181,57 +234,57 @@ class BatchProblem(BatchedRecord):
         for muscles, projected in ((True, False), (False, False), (False, True)):
             if (muscles and part_tensions is None) or len(remaining) == 0:
                 continue
-            matrices = self.body.elasticity.matrices(
-                end[remaining], gradients[remaining], self.dt, diagonal, projected=projected
+            entries = self.body.elements.enqueue_entries(
+                as_warp(end[remaining], Vec3),
+                as_warp(gradients[remaining], Mat33),
+                self.dt,
+                factor=self.dt**2,
+                projected=projected,
             )
+            stiffness = None
             if muscles and part_tensions is not None:
-                self.body.elasticity.add_stiffness(
-                    matrices, end[remaining], part_tensions[remaining], self.dt**2, min_relative=MIN_RELATIVE_STIFFNESS
+                stiffness = partial(
+                    self.body.add_muscle_stiffness,
+                    positions=end[remaining],
+                    tensions=part_tensions[remaining],
+                    factor=self.dt**2,
                 )
-            factored[remaining] = self.body.factors.factor(slots[remaining], matrices)
+            factors = self.body.factors
+            factors.factor(wp.to_torch(entries)[: len(remaining)], diagonal, slots[remaining], stiffness)
+            factored[remaining] = factors.status[slots[remaining]] == FactorStatus.DEFINITE
             remaining = nonzero(~factored)
         return factored
 
 
-@dataclass(frozen=True)
-class BatchMomentumProjection(BatchedRecord):
-    """Rank-3 correction with which the solutions conserve angular momentum (``Tangent``)."""
-
-    rotation_response: torch.Tensor
-    """(c, 3N, 3) solutions U for the right-hand sides M T."""
-    inverse: torch.Tensor
-    """(c, 3, 3) inverse of (1 + dt alpha) (M T)^T U."""
+@dataclass(frozen=True, eq=False)
+class BatchMomentumProjection(MomentumProjection, BatchedRecord):
+    """``MomentumProjection`` of c worlds."""
 
 
 def apply_inverse(
-    problem: BatchProblem, impulses: torch.Tensor, turning: BatchMomentumProjection | None = None
+    problem: BatchProblem, impulses: torch.Tensor, projection: BatchMomentumProjection | None = None
 ) -> tuple[torch.Tensor, BatchMomentumProjection]:
     """Return the velocity changes J^-1 ``impulses`` and the momentum projection that was used.
 
     Args:
         problem: the step, whose slots hold factors.
         impulses: (c, 3N, m) N s.
-        turning: momentum projection of these factors; computed if None.
+        projection: momentum projection of these factors; computed if None.
 
     Returns:
         (c, 3N, m) m/s, and the momentum projection.
     """
-    factors, momenta = problem.body.factors, problem.momenta
-    if turning is None:
-        both = factors.solve(problem.slots, torch.cat([momenta.mT, impulses], dim=2))
-        response, plain = both[:, :, :3].contiguous(), both[:, :, 3:]
-        turning = BatchMomentumProjection(
-            response, torch.linalg.inv_ex(problem.inertia_ratio * (momenta @ response)).inverse
-        )
-    else:
-        plain = factors.solve(problem.slots, impulses)
-    missing = problem.rotation_modes.mT @ impulses - problem.inertia_ratio * (momenta @ plain)
-    return plain + turning.rotation_response @ (turning.inverse @ missing), turning
+    factors = problem.body.factors
+    if projection is not None:
+        return factors.solve(impulses, problem.slots, projection), projection
+    momenta = problem.momenta.mT.contiguous()
+    both = factors.solve(torch.cat([momenta, impulses], dim=2), problem.slots)
+    projection = BatchMomentumProjection.of(
+        problem.rotation_modes, momenta, problem.inertia_ratio, both[:, :, :3].contiguous(), _inverse
+    )
+    return projection.corrected(impulses, both[:, :, 3:]), projection
 
 
-def _rotate(vectors: torch.Tensor, arms: torch.Tensor) -> torch.Tensor:
-    """Rotate ``arms`` (c, n, 3) by the rotation vectors ``vectors`` (c, 3) rad."""
-    half = 0.5 * vectors.norm(dim=1, keepdim=True)
-    axis = (0.5 * torch.sinc(half / torch.pi) * vectors)[:, None].expand_as(arms)
-    once = torch.linalg.cross(axis, arms)
-    return arms + 2.0 * (half.cos()[:, :, None] * once + torch.linalg.cross(axis, once))
+def _inverse(matrices: torch.Tensor) -> torch.Tensor:
+    """Return the inverses of ``matrices``, not finite for singular ones; an exception would stop all worlds."""
+    return torch.linalg.inv_ex(matrices).inverse

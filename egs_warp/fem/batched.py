@@ -60,12 +60,6 @@ def repeat_offsets(offsets: np.ndarray, count: int, step: int, device: torch.dev
     return torch.where(first < 0, first, first + shifts).flatten(0, 1)
 
 
-def repeat_bounds(bounds: np.ndarray, count: int, device: torch.device) -> torch.Tensor:
-    """Repeat the row offsets ``bounds`` (m + 1,) of a CSR-like map ``count`` times: (count m + 1,) int32."""
-    last = torch.full((1,), count * int(bounds[-1]), dtype=torch.int32, device=device)
-    return torch.cat([repeat_offsets(bounds[:-1], count, int(bounds[-1]), device), last])
-
-
 def launch_on(
     device: torch.device,
     kernel: Any,

@@ -14,10 +14,11 @@ import warp as wp
 
 from egs_warp.fem.assembly_topology import AssemblyTopology, Damping, Material
 from egs_warp.fem.linear_solver import LinearSolver
-from egs_warp.fem.multifrontal import SymbolicFactorization
+from egs_warp.fem.multifrontal import MultifrontalLdl, SymbolicFactorization
 from egs_warp.fem.simd_elasticity import SimdElasticity
 from egs_warp.fem.warp_elasticity import WarpElasticity
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.launching import PinnedMirror
 from egs_warp.muscles.tension import MuscleEnergy
 
 
@@ -30,7 +31,13 @@ class ElasticAssembly:
         self.upper_pattern = self.maps.upper_pattern
         self.diagonal_entries = self.upper_pattern.indptr[1:] - 1
         on_device = SimdElasticity if self.device.is_cpu else WarpElasticity
-        self.elements = on_device(self.maps, material, self.device)
+        elements = on_device(self.maps, material, self.device)
+        # Any, because the arguments of one implementation are results of the same one.
+        self.elements: Any = elements
+        self._positions, self._gradient, self._energies = map(
+            PinnedMirror, (elements.node_vectors(), elements.node_vectors(), elements.determinants_and_energies)
+        )
+        self._segments: Any = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the mesh and the material only; the copy rebuilds the arrays on its device."""
@@ -45,13 +52,44 @@ class ElasticAssembly:
         """Symbolic factorization of ``upper_pattern``."""
         return SymbolicFactorization.of(self.upper_pattern)
 
+    def new_solver(self) -> LinearSolver:
+        """Return a linear solver for ``upper_pattern``: sparse on a CPU, dense on a GPU, which requires PyTorch.
+
+        On an H100 the inverse of a dense factor takes 0.15 ms for 568 nodes and 0.44 ms for 1,064.
+        """
+        if self.device.is_cpu:
+            return MultifrontalLdl(self.upper_pattern, self.analysis)
+        from egs_warp.fem.tiled_cholesky import TiledCholesky
+
+        return TiledCholesky(self.upper_pattern, device=str(self.device))
+
     def damping(self, positions: np.ndarray, dt: float) -> Damping:
         """Return the damping of a step of ``dt`` seconds that starts at ``positions`` (N, 3) m."""
-        return Damping(dt, self.elements.start(positions))
+        start = self.elements.new_start()
+        self._positions.put(positions)
+        self.elements.enqueue_start(self._positions.array, start)
+        return Damping(dt, start)
+
+    def _upload(self, positions: np.ndarray, damping: Damping | None) -> tuple[wp.array, wp.array | None, float]:
+        """Return the first arguments of the launches of the elements."""
+        self._positions.put(positions)
+        start, dt = (None, 0.0) if damping is None else (damping.start, damping.dt)
+        return self._positions.array, start, dt
+
+    def load_segments(self, tension: MuscleEnergy | None) -> Any:
+        """Return the segments of ``tension`` as the elements read them, loaded with its tensions, or None; they are
+        cached for one set of muscles."""
+        if tension is None:
+            return None
+        if self._segments is None or self._segments.rows is not tension.rows:
+            self._segments = self.elements.segments(tension.rows, tension.rest_lengths)
+        self._segments.tensions.put(tension.tensions)
+        return self._segments
 
     def determinants(self, positions: np.ndarray) -> np.ndarray:
         """Return J = det F (T,) at ``positions`` (N, 3); not positive where an element is inverted."""
-        return self.elements.energy(positions, None)[1]
+        self.elements.enqueue_energies(*self._upload(positions, None))
+        return self._energies.get()[: len(self.mesh.tets)]
 
     def energy(self, positions: np.ndarray, damping: Damping | None = None) -> float:
         """Return the elastic energy Psi(positions), J; infinite if an element is inverted.
@@ -59,7 +97,8 @@ class ElasticAssembly:
         With ``damping``, add dt beta/2 sum V E':C:E', where E' = (F^T F - F0^T F0) / (2 dt) is the mean strain rate of
         the step.
         """
-        return self.elements.energy(positions, damping)[0]
+        self.elements.enqueue_energies(*self._upload(positions, damping))
+        return self._sum(self._energies.get())
 
     def gradient(
         self, positions: np.ndarray, damping: Damping | None = None, tension: MuscleEnergy | None = None
@@ -68,11 +107,26 @@ class ElasticAssembly:
 
         With ``tension``, add the gradient of the muscle energy.
         """
-        return self.elements.gradient(positions, damping, tension)
+        segments = self.load_segments(tension)
+        self.elements.enqueue_gradient(*self._upload(positions, damping), segments, self._gradient.array)
+        return self._gradient.get().reshape(-1, 3)
 
     def energy_and_gradient(self, positions: np.ndarray, damping: Damping | None = None) -> tuple[float, np.ndarray]:
         """Return ``energy`` and ``gradient`` without muscles."""
-        return self.elements.energy_and_gradient(positions, damping)
+        inputs = self._upload(positions, damping)
+        self.elements.enqueue_energies(*inputs)
+        self.elements.enqueue_gradient(*inputs, None, self._gradient.array)
+        energies, gradient = PinnedMirror.get_all(self._energies, self._gradient)
+        return self._sum(energies), gradient.reshape(-1, 3)
+
+    def _sum(self, determinants_and_energies: np.ndarray) -> float:
+        return float(determinants_and_energies[self.elements.energy_offset :].sum())
+
+    def enqueue_hessian(
+        self, positions: np.ndarray, damping: Damping | None = None, *, factor: float = 1.0, projected: bool = False
+    ) -> wp.array:
+        """Queue ``hessian_entries``; return the output array, which the next call overwrites."""
+        return self.elements.enqueue_entries(*self._upload(positions, damping), factor=factor, projected=projected)
 
     def hessian_entries(
         self, positions: np.ndarray, damping: Damping | None = None, *, factor: float = 1.0, projected: bool = False
@@ -85,22 +139,7 @@ class ElasticAssembly:
             factor: multiplies all entries.
             projected: project the Hessian of each element to a positive semi-definite one.
         """
-        return self.elements.hessian_entries(positions, damping, factor=factor, projected=projected)
-
-    def entries_for(
-        self,
-        factors: LinearSolver,
-        positions: np.ndarray,
-        damping: Damping | None,
-        *,
-        factor: float = 1.0,
-        projected: bool = False,
-    ) -> Any:
-        """Return ``hessian_entries`` where ``factors`` read them: a NumPy array, or a PyTorch tensor on the device."""
-        if factors.is_host:
-            return self.hessian_entries(positions, damping, factor=factor, projected=projected)
-        assert isinstance(self.elements, WarpElasticity)
-        return self.elements.entries_on_device(positions, damping, factor=factor, projected=projected)
+        return self.enqueue_hessian(positions, damping, factor=factor, projected=projected).numpy().flatten()
 
     def matrix(self, entries: np.ndarray) -> sparse.csc_matrix:
         """Return the upper triangle (3N, 3N) with the given ``entries`` (nnz,)."""

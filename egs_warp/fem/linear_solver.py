@@ -3,45 +3,59 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
+from enum import IntEnum
 from typing import Any, Protocol
 
 import numpy as np
-import scipy.sparse as sparse
 import warp as wp
 
 from egs_warp.fem.momentum_projection import MomentumProjection
-from egs_warp.fem.multifrontal import MultifrontalLdl
+
+
+class FactorStatus(IntEnum):
+    """State of the factors of the last matrix."""
+
+    NONE = 0
+    """No factors: the matrix is not finite or is singular. A Cholesky solver has none of an indefinite matrix either.
+    """
+    INDEFINITE = 1
+    """Factors of an indefinite matrix."""
+    DEFINITE = 2
+    """Factors of a positive definite matrix."""
 
 
 class LinearSolver(Protocol):
     """Direct solver for symmetric matrices S of one sparsity pattern, plus an optional low-rank term."""
 
-    is_host: bool
-    """True if entries are NumPy arrays; False if they are PyTorch tensors on the device."""
+    is_asynchronous: bool
+    """True if ``factor`` only queues its work."""
 
     @property
     def stream(self) -> AbstractContextManager[None]:
         """Context within which calls need no stream switches."""
         ...
 
-    def update(self, entries: Any, diagonal: np.ndarray | None = None) -> bool:
+    def entries_from(self, entries: wp.array) -> Any:
+        """Return a copy of ``entries`` (nnz,) or (1, nnz) where this solver reads them: in a NumPy array, or in a
+        PyTorch tensor on its device."""
+        ...
+
+    def factor(self, entries: Any, diagonal: np.ndarray | None = None) -> None:
         """Factor S.
 
         Args:
             entries: (nnz,) upper entries in the order of the pattern.
             diagonal: (n,) added to the diagonal, or None.
-
-        Returns:
-            True if S is positive definite.
         """
         ...
 
-    def start_update(self, entries: Any, diagonal: np.ndarray | None = None) -> None:
-        """Start ``update`` asynchronously where the solver supports it; ``is_ready`` waits for the result."""
+    @property
+    def status(self) -> FactorStatus:
+        """Status of the factors; blocks until queued ones are computed."""
         ...
 
     def add_low_rank(self, across: np.ndarray, rates: np.ndarray) -> bool:
-        """Replace S by S + U diag(r) U^T in the following solves. This succeeds at most once per ``update``.
+        """Replace S by S + U diag(r) U^T in the following solves. This succeeds at most once per ``factor``.
 
         Args:
             across: (n, k) U.
@@ -52,16 +66,11 @@ class LinearSolver(Protocol):
         """
         ...
 
-    @property
-    def is_ready(self) -> bool:
-        """True if factors exist; blocks until queued ones are computed."""
-        ...
-
     def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
         """Solve for ``right`` (n,) or for each column of (n, m); apply ``projection`` if given."""
         ...
 
-    def effort_quadratic(
+    def quadratic_form(
         self,
         entries: Any,
         gradient: np.ndarray,
@@ -87,23 +96,6 @@ class LinearSolver(Protocol):
             reference: (n,) subtracted from the last column of X.
 
         Returns:
-            X^T H X (m, m) and X^T g (m,).
+            X^T H X (m, m) and X^T g (m,); not finite if there are no factors.
         """
         ...
-
-
-def linear_solver_on(device: wp.Device, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> LinearSolver:
-    """Return a dense solver on a GPU that PyTorch can use, and otherwise a sparse solver on the host.
-
-    On an H100 the inverse of a dense factor takes 0.15 ms for 568 nodes and 0.44 ms for 1,064.
-    """
-    if device.is_cuda:
-        try:
-            import torch
-        except ImportError:
-            return MultifrontalLdl(upper_pattern)
-        if torch.cuda.is_available():
-            from egs_warp.fem.dense_cholesky import DenseCholesky
-
-            return DenseCholesky(upper_pattern, device=str(device))
-    return MultifrontalLdl(upper_pattern)

@@ -2,32 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
 
 @dataclass(frozen=True, eq=False)
 class MomentumProjection:
-    """Correction by rigid rotations that gives solutions the angular momenta of their right-hand sides."""
+    """Correction by rigid rotations that gives solutions the angular momenta of their right-hand sides.
 
-    rotation_modes: np.ndarray
+    Arrays are NumPy arrays or PyTorch tensors, also with a leading world axis.
+    """
+
+    rotation_modes: Any
     """(n, 3) rigid rotations T, as nodal velocities."""
-    mode_momenta: np.ndarray
+    mode_momenta: Any
     """(n, 3) M T; (M T)^T v is the angular momentum of velocities v."""
     inertia_ratio: float
     """Factor of the angular momentum of a solution, 1 + dt alpha."""
-    rotation_response: np.ndarray
+    rotation_response: Any
     """(n, 3) U, solutions for the right-hand sides M T."""
-    inverse: np.ndarray
+    inverse: Any
     """(3, 3) inverse of inertia_ratio (M T)^T U."""
 
-    def corrected(self, right: np.ndarray, plain: np.ndarray) -> np.ndarray:
+    @classmethod
+    def of(
+        cls,
+        rotation_modes: Any,
+        mode_momenta: Any,
+        inertia_ratio: float,
+        rotation_response: Any,
+        invert: Callable[[Any], Any] = np.linalg.inv,
+    ) -> Self:
+        """Build the projection; ``invert`` returns the inverses of 3 x 3 matrices."""
+        inverse = invert(inertia_ratio * mode_momenta.swapaxes(-1, -2) @ rotation_response)
+        return cls(rotation_modes, mode_momenta, inertia_ratio, rotation_response, inverse)
+
+    def corrected(self, right: Any, plain: Any) -> Any:
         """Return the corrected solution.
 
         Args:
-            right: (n,) or (n, m) right-hand sides.
+            right: (n, m) right-hand sides, or (n,).
             plain: solutions for them, of the same shape.
         """
-        missing = self.rotation_modes.T @ right - self.inertia_ratio * (self.mode_momenta.T @ plain)
+        modes, momenta = self.rotation_modes.swapaxes(-1, -2), self.mode_momenta.swapaxes(-1, -2)
+        missing = modes @ right - self.inertia_ratio * (momenta @ plain)
         return plain + self.rotation_response @ (self.inverse @ missing)

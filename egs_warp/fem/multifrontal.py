@@ -15,6 +15,7 @@ import scipy.sparse as sparse
 import warp as wp
 
 from egs_warp.fem.front_layout import FrontLayout, as_index_array
+from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.fem.supernodes import Supernodes, first_of_equal_rows
 from egs_warp.kernels.fem import supernodal as kernels
@@ -71,7 +72,7 @@ class MultifrontalLdl:
     the muscles' stiffness are used; a nearly singular matrix is reported as having no factors.
     """
 
-    is_host = True
+    is_asynchronous = False
     stream: AbstractContextManager[None] = nullcontext()
 
     def __init__(
@@ -80,7 +81,7 @@ class MultifrontalLdl:
         """Allocate the solver.
 
         Args:
-            upper_pattern: (n, n) upper triangle with the diagonal, entries in the order of ``update``.
+            upper_pattern: (n, n) upper triangle with the diagonal, entries in the order of ``factor``.
             analysis: symbolic factorization of the pattern; computed if None.
         """
         self._device = wp.get_device("cpu")
@@ -113,20 +114,20 @@ class MultifrontalLdl:
         self._no_projection, self._projection = _ProjectionArrays(0).struct, _ProjectionArrays(self._unknowns)
         self._projection.struct.enabled = 1
         self._effort: _EffortWorkspace | None = None
-        self._ready = False
         self._added: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         """U (n, k), S^-1 U (n, k) and the inverse (k, k) of the capacitance matrix diag(1/r) + U^T S^-1 U."""
-        self.negative_pivots = 0
-        """Number of negative eigenvalues of the last matrix; -1 if it was singular."""
+        self.negative_pivots = -1
+        """Number of negative eigenvalues of the last matrix; -1 if it has no factors."""
 
-    def update(self, entries: np.ndarray, diagonal: np.ndarray | None = None) -> bool:
-        """Factor S; see ``LinearSolver.update``.
+    def entries_from(self, entries: wp.array) -> np.ndarray:
+        """Return a copy of ``entries`` on the host."""
+        return entries.numpy().flatten()
 
-        The factors of an indefinite matrix can be used for solves, too. ``solve`` requires ``is_ready``.
-        """
-        self._ready, self._added = False, None
+    def factor(self, entries: np.ndarray, diagonal: np.ndarray | None = None) -> None:
+        """Factor S; see ``LinearSolver.factor``. The factors of an indefinite matrix can be used for solves, too."""
+        self.negative_pivots, self._added = -1, None
         if not np.isfinite(entries).all():
-            return False
+            return
         self._entries[:] = entries
         if diagonal is not None:
             self._entries[self._diagonal] += diagonal
@@ -148,20 +149,20 @@ class MultifrontalLdl:
             outputs=[self._negative_array],
             device=self._device,
         )
-        self._ready, self.negative_pivots = bool(self._negative[0] >= 0), int(self._negative[0])
-        return self.negative_pivots == 0
+        self.negative_pivots = int(self._negative[0])
 
-    def start_update(self, entries: np.ndarray, diagonal: np.ndarray | None = None) -> None:
-        """Call ``update``, synchronously."""
-        self.update(entries, diagonal)
+    @property
+    def status(self) -> FactorStatus:
+        """Status of the factors."""
+        if self._added is not None or self.negative_pivots == 0:
+            return FactorStatus.DEFINITE
+        return FactorStatus.INDEFINITE if self.negative_pivots > 0 else FactorStatus.NONE
 
     def add_low_rank(self, across: np.ndarray, rates: np.ndarray) -> bool:
         """Add a low-rank term by the Woodbury formula, also to an indefinite S; see ``LinearSolver.add_low_rank``."""
-        if not self.is_ready:
-            return False
-        if len(rates) == 0:
-            return self.negative_pivots == 0
         self._added = None
+        if self.status is FactorStatus.NONE or len(rates) == 0:
+            return self.status is FactorStatus.DEFINITE
         through = self.solve(across)
         small = across.T @ through
         small[np.diag_indices_from(small)] += 1.0 / rates
@@ -173,11 +174,6 @@ class MultifrontalLdl:
         self._added = np.ascontiguousarray(across), np.ascontiguousarray(through), np.ascontiguousarray(inverse)
         return True
 
-    @property
-    def is_ready(self) -> bool:
-        """True if factors exist."""
-        return self._ready
-
     def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
         """Solve for ``right``; see ``LinearSolver.solve``."""
         if self._added is None:
@@ -187,7 +183,7 @@ class MultifrontalLdl:
         plain -= through @ (small @ (across.T @ plain))
         return plain if projection is None else projection.corrected(right, plain)
 
-    def effort_quadratic(
+    def quadratic_form(
         self,
         entries: np.ndarray,
         gradient: np.ndarray,
@@ -198,9 +194,11 @@ class MultifrontalLdl:
         dt_ahead: float,
         reference: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the quadratic model of the elastic energy with two threads; see ``LinearSolver.effort_quadratic``."""
-        assert self._ready and self._added is None, "call update() first"
+        """Compute the quadratic model of the elastic energy with two threads; see ``LinearSolver.quadratic_form``."""
+        assert self._added is None
         count = vectors.shape[1]
+        if self.status is FactorStatus.NONE:
+            return np.full((count, count), np.nan), np.full(count, np.nan)
         panels = -(-count // kernels.PANEL)
         if self._effort is None or len(self._effort.linear) != panels:
             self._effort = _EffortWorkspace(panels, self._unknowns)
@@ -225,7 +223,7 @@ class MultifrontalLdl:
         return workspace.quadratic[:count, :count].copy(), workspace.linear.ravel()[:count].copy()
 
     def _solve_unprojected(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
-        assert self._ready, "call update() first"
+        assert self.status is not FactorStatus.NONE, "call factor() first"
         right = np.asarray(right, dtype=np.float64)
         solution = np.empty(right.shape)
         panels = -(-(1 if right.ndim == 1 else right.shape[1]) // kernels.PANEL)
@@ -262,7 +260,7 @@ class MultifrontalLdl:
             The arguments for the factors and the projection; the number k of added directions and the addresses of U,
             S^-1 U and the inverse of the capacitance matrix, zeros if none are added; and the workspace.
         """
-        assert self._ready, "call update() first"
+        assert self.status is not FactorStatus.NONE, "call factor() first"
         added = [0, 0, 0, 0]
         if self._added is not None:
             across, through, small = self._added
@@ -314,7 +312,7 @@ class _ProjectionArrays:
 
 
 class _EffortWorkspace:
-    """Workspace of ``effort_quadratic`` for a given number of panels."""
+    """Workspace of ``quadratic_form`` for a given number of panels."""
 
     def __init__(self, panels: int, unknowns: int) -> None:
         self.moves, self.products = (zeros((panels, unknowns, kernels.PANEL), real, "cpu") for _ in range(2))

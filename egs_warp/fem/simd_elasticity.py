@@ -5,24 +5,43 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sparse
 import warp as wp
 
-from egs_warp.fem.assembly_topology import AssemblyTopology, Damping, Material
+from egs_warp.fem.assembly_topology import AssemblyTopology, Material
 from egs_warp.kernels.fem import elasticity_cpu as kernels
 from egs_warp.kernels.fem.elasticity import DIAGONAL_TOLERANCE, MAX_SWEEPS
-from egs_warp.launching import empty, launch_cached
-from egs_warp.muscles.tension import LENGTH_FULL_FORCE, LENGTH_ZERO_FORCE, MuscleEnergy
+from egs_warp.launching import PinnedMirror, empty, launch_cached, zeros
+from egs_warp.muscles.tension import LENGTH_FULL_FORCE, LENGTH_ZERO_FORCE
 from egs_warp.precision import real
 
 
+class SimdSegments:
+    """Segments of one set of muscles as the kernels read them."""
+
+    def __init__(self, rows: sparse.csr_matrix, rest_lengths: np.ndarray, device: wp.Device) -> None:
+        self.rows = rows
+        self.tensions = PinnedMirror(zeros(len(rest_lengths), real, device))
+        """(M,) N, set by the host."""
+        self.struct = kernels.MuscleSegments()
+        self.struct.offsets, self.struct.nodes = (
+            wp.array(part.astype(np.int32), dtype=int, device=device) for part in (rows.indptr, rows.indices)
+        )
+        self.struct.weights, self.struct.rest_lengths = (
+            wp.array(part, dtype=real, device=device) for part in (rows.data, rest_lengths)
+        )
+        self.struct.tensions = self.tensions.array
+        self.struct.length_zero_force, self.struct.length_full_force = LENGTH_ZERO_FORCE, LENGTH_FULL_FORCE
+
+
 class SimdElasticity:
-    """Elasticity of one mesh on the CPU: arrays in groups of four elements, and scratch memory."""
+    """``WarpElasticity`` of one world on a CPU: arrays in groups of four elements, and scratch memory."""
 
     def __init__(self, maps: AssemblyTopology, material: Material, device: wp.Device) -> None:
-        self._device, self._tet_count = device, len(maps.tets)
-        more = -self._tet_count % kernels.LANES
+        self._device, self._node_count, tet_count = device, len(maps.corner_offsets) - 1, len(maps.tets)
+        more = -tet_count % kernels.LANES
         # Copies of the last element with zero volume fill the last group.
-        padded = np.r_[np.arange(self._tet_count), np.full(more, self._tet_count - 1)]
+        padded = np.r_[np.arange(tet_count), np.full(more, tet_count - 1)]
         groups = len(padded) // kernels.LANES
         rests = maps.rest_inverses[padded].reshape(groups, kernels.LANES, 9).transpose(0, 2, 1)
         elements = kernels.Elements()
@@ -33,117 +52,59 @@ class SimdElasticity:
         elements.mu, elements.lam, elements.damping_time = material.mu, material.lam, material.damping_time
         self.elements = elements
         """The mesh as the kernels read it."""
-        self._no_segments = _no_segments(device)
-        self._muscles: _Muscles | None = None
+        self._no_segments = self.segments(sparse.csr_matrix((0, self._node_count)), np.zeros(0)).struct
         self._no_start = empty(0, real, device)
-        self._positions, self._positions_array = _shared((len(maps.corner_offsets) - 1, 3), device)
-        self._gradient, self._gradient_array = _shared(self._positions.shape, device)
-        self._energy, self._energy_array = _shared((1,), device)
-        self._determinants, self._determinants_array = _shared((len(padded),), device)
-        self._entries, self._entries_array = _shared((maps.upper_pattern.nnz,), device)
+        self.energy_offset = len(padded)
+        self.determinants_and_energies = zeros(self.energy_offset + 1, real, device)
+        both: Any = self.determinants_and_energies
+        self._determinants, self._energy = both[: self.energy_offset], both[self.energy_offset :]
+        self._entries = zeros(maps.upper_pattern.nnz, real, device)
 
-    def start(self, positions: np.ndarray) -> wp.array:
-        """Return F^T F of all elements at ``positions`` (N, 3), the reference of the damping of a step."""
-        start = empty(6 * len(self._determinants), real, self._device)
-        self._positions[:] = positions
-        launch_cached(
-            kernels.starts_kernel,
-            1,
-            inputs=[self.elements, self._positions_array],
-            outputs=[start],
-            device=self._device,
-        )
-        return start
+    def node_vectors(self) -> wp.array:
+        """Return an array (N, 3) of zeros."""
+        return zeros((self._node_count, 3), real, self._device)
 
-    def _inputs(self, positions: np.ndarray, damping: Damping | None) -> list:
-        self._positions[:] = positions
-        step = [self._no_start, 0.0] if damping is None else [damping.start, damping.dt]
-        return [self._positions_array, *step]
+    def new_start(self) -> wp.array:
+        """Return an array for F^T F of all elements at the start of a step."""
+        return empty(6 * self.energy_offset, real, self._device)
 
-    def energy(self, positions: np.ndarray, damping: Damping | None) -> tuple[float, np.ndarray]:
-        """Return the energy, J, and det F (T,)."""
-        launch_cached(
-            kernels.energy_kernel,
-            1,
-            inputs=[self.elements, *self._inputs(positions, damping)],
-            outputs=[self._energy_array, self._determinants_array],
-            device=self._device,
-        )
-        return float(self._energy[0]), self._determinants[: self._tet_count].copy()
+    def segments(self, rows: sparse.csr_matrix, rest_lengths: np.ndarray) -> SimdSegments:
+        """Return muscle segments with difference ``rows`` (M, N) and ``rest_lengths`` (M,) m."""
+        return SimdSegments(rows, rest_lengths, self._device)
 
-    def energy_and_gradient(self, positions: np.ndarray, damping: Damping | None) -> tuple[float, np.ndarray]:
-        """Return the energy, J, and its gradient (N, 3), N, of elasticity and damping."""
-        return self.energy(positions, damping)[0], self.gradient(positions, damping, None)
+    def struct_of(self, segments: SimdSegments | None) -> Any:
+        """Return the kernels' struct of ``segments``, with no segments if it is None."""
+        return self._no_segments if segments is None else segments.struct
 
-    def gradient(self, positions: np.ndarray, damping: Damping | None, tension: MuscleEnergy | None) -> np.ndarray:
-        """Return the gradient (N, 3), N, of elasticity, damping and muscles."""
-        segments = self.lines_of(tension)
-        launch_cached(
-            kernels.gradient_kernel,
-            1,
-            inputs=[self.elements, segments, *self._inputs(positions, damping)],
-            outputs=[self._gradient_array],
-            device=self._device,
-        )
-        return self._gradient.copy()
+    def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        launch_cached(kernel, 1, inputs=[self.elements, *inputs], outputs=outputs, device=self._device)
 
-    def lines_of(self, tension: MuscleEnergy | None) -> Any:
-        """Return the kernels' struct of the segments of ``tension``, with no segments if it is None."""
-        if tension is None:
-            return self._no_segments
-        if self._muscles is None or self._muscles.rows is not tension.rows:
-            self._muscles = _Muscles(tension, self._device)
-        self._muscles.tensions[:] = tension.tensions
-        return self._muscles.segments
+    def _state(self, positions: wp.array, start: wp.array | None, dt: float) -> list[Any]:
+        return [positions, self._no_start if start is None else start, dt]
 
-    def hessian_entries(
-        self, positions: np.ndarray, damping: Damping | None, *, factor: float, projected: bool
-    ) -> np.ndarray:
-        """Return the upper entries (nnz,) of ``factor`` times the Hessian; see ``ElasticAssembly.hessian_entries``."""
-        launch_cached(
-            kernels.hessian_kernel,
-            1,
-            inputs=[
-                self.elements,
-                *self._inputs(positions, damping),
-                factor,
-                int(projected),
-                DIAGONAL_TOLERANCE,
-                MAX_SWEEPS,
-            ],
-            outputs=[self._entries_array],
-            device=self._device,
-        )
-        return self._entries.copy()
+    def enqueue_start(self, positions: wp.array, start: wp.array) -> None:
+        """Compute F^T F of all elements at ``positions`` (N, 3), the reference of the damping of a step."""
+        self._launch(kernels.starts_kernel, [positions], [start])
 
+    def enqueue_energies(self, positions: wp.array, start: wp.array | None, dt: float) -> tuple[wp.array, wp.array]:
+        """Compute the energy (1,) J and the determinants of the elements; see ``WarpElasticity``."""
+        self._launch(kernels.energy_kernel, self._state(positions, start, dt), [self._energy, self._determinants])
+        return self._energy, self._determinants
 
-class _Muscles:
-    """Segments of one set of muscles as the kernels read them."""
+    def enqueue_gradient(
+        self, positions: wp.array, start: wp.array | None, dt: float, segments: SimdSegments | None, gradient: wp.array
+    ) -> None:
+        """Compute the ``gradient`` (N, 3), N; see ``WarpElasticity``."""
+        inputs = [self.struct_of(segments), *self._state(positions, start, dt)]
+        self._launch(kernels.gradient_kernel, inputs, [gradient])
 
-    def __init__(self, tension: MuscleEnergy, device: wp.Device) -> None:
-        self.rows = tension.rows
-        self.tensions, array = _shared(tension.tensions.shape, device)
-        self.segments = _no_segments(device)
-        self.segments.offsets, self.segments.nodes = (
-            wp.array(part.astype(np.int32), dtype=int, device=device) for part in (self.rows.indptr, self.rows.indices)
-        )
-        self.segments.weights, self.segments.rest_lengths = (
-            wp.array(part, dtype=real, device=device) for part in (self.rows.data, tension.rest_lengths)
-        )
-        self.segments.tensions = array
-
-
-def _no_segments(device: wp.Device) -> Any:
-    segments = kernels.MuscleSegments()
-    segments.offsets, segments.nodes = empty(0, int, device), empty(0, int, device)
-    segments.weights, segments.rest_lengths, segments.tensions = (empty(0, real, device) for _ in range(3))
-    segments.length_zero_force, segments.length_full_force = LENGTH_ZERO_FORCE, LENGTH_FULL_FORCE
-    return segments
-
-
-def _shared(shape: tuple[int, ...], device: wp.Device) -> tuple[np.ndarray, wp.array]:
-    values = np.zeros(shape)
-    return values, wp.array(values, dtype=real, device=device, copy=False)
+    def enqueue_entries(
+        self, positions: wp.array, start: wp.array | None, dt: float, *, factor: float, projected: bool
+    ) -> wp.array:
+        """Compute the upper entries (nnz,) of ``factor`` times the Hessian; see ``WarpElasticity``."""
+        options = [factor, int(projected), DIAGONAL_TOLERANCE, MAX_SWEEPS]
+        self._launch(kernels.hessian_kernel, [*self._state(positions, start, dt), *options], [self._entries])
+        return self._entries
 
 
 def _entries_of_pairs(maps: AssemblyTopology) -> np.ndarray:

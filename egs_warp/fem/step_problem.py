@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.assembly_topology import Damping
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.linear_solver import LinearSolver
+from egs_warp.fem.linear_solver import FactorStatus, LinearSolver
 from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.geometry.frames import cross_matrices
 from egs_warp.muscles.tension import MuscleEnergy
@@ -92,6 +91,11 @@ class StepProblem:
         return self.body.angular_momentum(self.state.positions, self.state.velocities)
 
     @property
+    def inertia_ratio(self) -> float:
+        """Factor 1 + dt alpha of the mass in the equation."""
+        return 1.0 + self.dt * self.drag
+
+    @property
     def residual_scale(self) -> float:
         """dt times the weight, N s, the unit of residual norms."""
         return self.dt * self.body.weight
@@ -142,9 +146,7 @@ class StepProblem:
         """
         internal = self.internal_gradient(velocities, tension)
         correction = (self.rotation_modes @ self.momentum_correction(internal)).reshape(velocities.shape)
-        change = (
-            (1.0 + self.dt * self.drag) * velocities - self.state.velocities - self.dt * self.body.gravity - correction
-        )
+        change = self.inertia_ratio * velocities - self.state.velocities - self.dt * self.body.gravity - correction
         return self.mass * change + self.dt * internal
 
     def tangent(self, factors: LinearSolver, velocities: np.ndarray, tension: MuscleEnergy | None) -> Tangent:
@@ -161,17 +163,16 @@ class StepProblem:
         Raises:
             UnsolvableStepError: there are no factors.
         """
-        if tension is None and not factors.is_host:
-            factors.start_update(*self._matrix(factors, velocities, projected=False))
+        self._factor(factors, velocities, projected=False)
+        if tension is None and factors.is_asynchronous:
             return Tangent(self, factors, velocities)
-        definite = self._factor(factors, velocities, projected=False)
         if tension is not None:
             across, rates = tension.hessian(self.end_positions(velocities)).factors(
                 min_relative_stiffness=MIN_RELATIVE_STIFFNESS
             )
             if factors.add_low_rank(across, self.dt**2 * rates):
                 return Tangent(self, factors)
-        if not definite:
+        if factors.status is not FactorStatus.DEFINITE:
             self.factor_near(factors, velocities)
         return Tangent(self, factors)
 
@@ -182,19 +183,14 @@ class StepProblem:
             UnsolvableStepError: there are no factors.
         """
         self._factor(factors, velocities, projected=True)
-        if not factors.is_ready:
+        if factors.status is FactorStatus.NONE:
             raise UnsolvableStepError(UNSOLVABLE)
 
-    def _factor(self, factors: LinearSolver, velocities: np.ndarray, *, projected: bool) -> bool:
-        """Factor S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``; return True if it is positive
-        definite."""
-        return factors.update(*self._matrix(factors, velocities, projected=projected))
-
-    def _matrix(self, factors: LinearSolver, velocities: np.ndarray, *, projected: bool) -> tuple[Any, np.ndarray]:
-        """Return the entries and the added diagonal of S for ``factors``."""
+    def _factor(self, factors: LinearSolver, velocities: np.ndarray, *, projected: bool) -> None:
+        """Factor S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``."""
         end = self.end_positions(velocities)
-        entries = self.body.assembly.entries_for(factors, end, self.damping, factor=self.dt**2, projected=projected)
-        return entries, (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3)
+        entries = self.body.assembly.enqueue_hessian(end, self.damping, factor=self.dt**2, projected=projected)
+        factors.factor(factors.entries_from(entries), self.inertia_ratio * np.repeat(self.body.node_mass, 3))
 
 
 @dataclass(frozen=True)
@@ -222,7 +218,7 @@ class Tangent:
         Raises:
             UnsolvableStepError: the approximation has no factors.
         """
-        if self.pending_velocities is None or self.factors.is_ready:
+        if self.pending_velocities is None or self.factors.status is FactorStatus.DEFINITE:
             return True
         self.problem.factor_near(self.factors, self.pending_velocities)
         return False
@@ -230,11 +226,9 @@ class Tangent:
     @cached_property
     def momentum_projection(self) -> MomentumProjection:
         """Momentum projection for the rotation modes of the step."""
-        problem = self.problem
-        ratio, momenta = 1.0 + problem.dt * problem.drag, np.ascontiguousarray(problem.momenta.T)
-        response = self.factors.solve(momenta)
-        return MomentumProjection(
-            problem.rotation_modes, momenta, ratio, response, np.linalg.inv(ratio * momenta.T @ response)
+        problem, momenta = self.problem, np.ascontiguousarray(self.problem.momenta.T)
+        return MomentumProjection.of(
+            problem.rotation_modes, momenta, problem.inertia_ratio, self.factors.solve(momenta)
         )
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:

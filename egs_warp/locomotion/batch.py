@@ -17,10 +17,10 @@ from egs_warp.contact.batch_step import BatchLinearization, BatchResult, BatchSo
 from egs_warp.contact.coupled_step import CoupledSolver
 from egs_warp.contact.detection import ContactGeometry, ContactSet
 from egs_warp.contact.selection import ContactSelector
-from egs_warp.fem.batch_factors import CHUNK_BYTES, PANEL
 from egs_warp.fem.batch_problem import BatchBody, BatchProblem, apply_inverse
 from egs_warp.fem.batched import BatchedRecord, nonzero
 from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.panel_cholesky import CHUNK_BYTES, PANEL
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.settling import SETTLING_STEP, SETTLING_STEPS, has_settled
 from egs_warp.locomotion.stepper import MAX_HALVINGS, PREDICTION_ITERATIONS, StepReport, WarmStart
@@ -235,7 +235,7 @@ class BatchStepper:
         """
         problem = self._problem(state, dt, 0.0)
         contacts, previous_forces, start_gaps = self._detect(problem, state)
-        velocities = problem.rigid_guess()
+        velocities = problem.rigid_guess
         failed = ~problem.factor(velocities, None)
         contacts, result = self.solver.solve(
             *(problem, contacts, self.solver.linearize(problem, contacts)),
@@ -350,7 +350,7 @@ class BatchStepper:
             not positive definite.
         """
         solver, stages = self.solver, self._stages
-        velocities, bias = problem.rigid_guess(), solver.normal_bias(contacts, problem.dt)
+        velocities, bias = problem.rigid_guess.clone(), solver.normal_bias(contacts, problem.dt)
         with stages("factor"):
             failed = ~problem.factor(velocities, None)
         with stages("elasticity"):

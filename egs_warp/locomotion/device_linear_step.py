@@ -194,7 +194,7 @@ class DeviceLinearSteps:
             self.owner.muscle_segments.enqueue_segment_forces(
                 as_warp(self._tensions, real), vectors(newton.end_positions)
             )
-        )
+        )[0]
 
     def write(self, newton: NewtonWorkspace, segment_forces: torch.Tensor, dt: float, velocities: torch.Tensor) -> None:
         """Write ``LinearStep.velocities`` about the last trial of ``newton``, which must be one without muscles
@@ -210,7 +210,7 @@ class DeviceLinearSteps:
         predicted_velocities, _, free, _ = newton.trial_parts()
         group_forces = segment_forces[:, :, None] * self._members[:, None, :]
         impulses = (self._rows.T @ group_forces.flatten(1)).mul_(-dt).view(-1, m)
-        solved = newton.apply_inverse(torch.hstack([impulses, free[:, None]]))
+        solved = self.owner.factors.enqueue_projected_solve(torch.hstack([impulses, free[:, None]]))
         velocities[:, :m] = solved[:, :-1]
         columns = velocities[:, m:-1]
         torch.mul(newton.columns[:, : columns.shape[1]], self.owner.body.weight, out=columns)

@@ -22,8 +22,8 @@ from egs_warp.contact.newton import ContactLinearization
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
-from egs_warp.fem.dense_cholesky import DenseCholesky
 from egs_warp.fem.step_problem import StepProblem, Tangent
+from egs_warp.fem.tiled_cholesky import TiledCholesky
 from egs_warp.kernels.locomotion import step_program as kernels
 from egs_warp.kernels.locomotion.active_set import OPTIMUM_FOUND
 from egs_warp.kernels.locomotion.mode_search import HEADER_SIZE
@@ -61,7 +61,7 @@ class DevicePlanner:
         linear: DeviceLinearSteps,
         progress: Callable[[StepProblem], NewtonProgress],
     ) -> None:
-        assert isinstance(planner.factors, DenseCholesky)
+        assert isinstance(planner.factors, TiledCholesky)
         self.planner, self.owner, self.linear, self.factors = planner, owner, linear, planner.factors
         self.progress = progress
         self.objective_staging, self.other_staging = StagingBuffer(owner.stream), StagingBuffer(owner.stream)
@@ -435,13 +435,14 @@ class PlanWorkspace:
         newton.trial_input.copy_(self._evaluate_input[base])
         newton.enqueue_residual(dt, ratio)
         segment_forces, ends = owner.linear.segment_forces(newton), vectors(newton.end_positions)
-        torch.sum(wp.to_torch(body.elements.enqueue_energies(ends, body.gradients, time)), dim=0, out=self._energy[0])
-        body.elements.enqueue_gradient(ends, body.gradients, time, None, body.no_tensions, vectors(self._gradient))
+        energies, _ = body.elements.enqueue_energies(ends, body.gradients, time)
+        torch.sum(wp.to_torch(energies)[0], dim=0, out=self._energy[0])
+        body.elements.enqueue_gradient(ends, body.gradients, time, None, vectors(self._gradient))
         entries = body.elements.enqueue_entries(ends, body.gradients, time, factor=1.0, projected=True)
-        self._entries.copy_(wp.to_torch(entries))
+        self._entries.copy_(wp.to_torch(entries)[0])
         body.stream.fork_join(
             [
-                lambda: owner.factors.enqueue(time**2 * self._entries),
+                lambda: owner.factors.enqueue_factor(time**2 * self._entries),
                 lambda: owner.linear.write(newton, segment_forces, dt, self._velocities),
             ]
         )
@@ -536,7 +537,7 @@ class PlanWorkspace:
         unit = EFFORT_WEIGHT / (body.body.weight * body.body.height)
         reference = dt * newton.trial_parts()[0]
         masses = body.masses.repeat_interleave(3)
-        quadratic, linear_terms = owner.factors.enqueue_effort_quadratic(
+        quadratic, linear_terms = owner.factors.enqueue_quadratic_form(
             self._entries, self._gradient, masses, self._velocities, dt, time - dt, reference
         )
         form.add_(quadratic, alpha=unit)

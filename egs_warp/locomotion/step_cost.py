@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from egs_warp.contact.detection import ContactSet
-from egs_warp.fem.linear_solver import LinearSolver
+from egs_warp.fem.linear_solver import FactorStatus, LinearSolver
 from egs_warp.fem.step_problem import StepProblem, UnsolvableStepError
 from egs_warp.locomotion.linear_step import LinearStep
 from egs_warp.locomotion.objectives import AnyObjective, Objective
@@ -142,9 +142,9 @@ class EffortModel:
             assembly.damping(problem.state.positions, duration),
         )
         energy, gradient = assembly.energy_and_gradient(positions, damping)
-        entries = assembly.entries_for(factors, positions, damping, projected=True)
+        entries = factors.entries_from(assembly.enqueue_hessian(positions, damping, projected=True))
         # Last, because a GPU factors asynchronously while the host continues.
-        factors.start_update(duration**2 * entries, np.repeat(body.node_mass, 3))
+        factors.factor(duration**2 * entries, np.repeat(body.node_mass, 3))
         return cls(positions, duration, energy, gradient.ravel(), entries, factors)
 
 
@@ -169,9 +169,7 @@ def effort_cost(
         model: energy, gradient and Hessian there.
     """
     body, factors = problem.body, model.factors
-    if factors.is_host:
-        _require_factors(factors)
-    quadratic, force = factors.effort_quadratic(
+    quadratic, force = factors.quadratic_form(
         model.stiffness_entries,
         model.gradient,
         np.repeat(body.node_mass, 3),
@@ -180,15 +178,11 @@ def effort_cost(
         dt_ahead=model.duration - problem.dt,
         reference=problem.dt * predicted_velocities,
     )
-    _require_factors(factors)
+    if factors.status is FactorStatus.NONE:
+        raise UnsolvableStepError("the effort matrix of the predicted end could not be factored")
     unit = weight / (body.weight * body.height)
     return QuadraticCost(
         unit * quadratic[:-1, :-1],
         unit * (force[:-1] + quadratic[:-1, -1]),
         unit * (model.energy + float(force[-1] + 0.5 * quadratic[-1, -1])),
     )
-
-
-def _require_factors(factors: LinearSolver) -> None:
-    if not factors.is_ready:
-        raise UnsolvableStepError("the effort matrix of the predicted end could not be factored")

@@ -20,7 +20,7 @@ from egs_warp.contact.detection import ContactDetector, ContactGeometry, Contact
 from egs_warp.contact.newton import ContactLinearization, ContactLinearizer, HostContactLinearizer
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.linear_solver import LinearSolver, linear_solver_on
+from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.linear_step import (
@@ -132,8 +132,8 @@ class LocomotionStepper:
             push_out_cap=self.settings.push_out_cap * body.speed_unit,
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
         )
-        self.factors = linear_solver_on(body.assembly.device, body.assembly.upper_pattern)
-        self._make_planners(linear_solver_on(body.assembly.device, body.assembly.upper_pattern))
+        self.factors = body.assembly.new_solver()
+        self._make_planners(body.assembly.new_solver())
 
     def _make_planners(self, planning_factors: LinearSolver) -> None:
         """Build the objects that depend on the elasticity of the body: linearizer, synergies and planners."""
@@ -500,9 +500,9 @@ def _make_linearizer(
         return HostContactLinearizer()
     from egs_warp.contact.device_newton import DeviceContactLinearizer
     from egs_warp.contact.device_selection import DeviceContactSelector
-    from egs_warp.fem.dense_cholesky import DenseCholesky
+    from egs_warp.fem.tiled_cholesky import TiledCholesky
 
-    assert isinstance(factors, DenseCholesky)
+    assert isinstance(factors, TiledCholesky)
     selector = DeviceContactSelector(solver.detector, solver.points, factors.stream, solver.penetration_tolerance)
     return DeviceContactLinearizer(factors, body, muscles, selector)
 

@@ -350,7 +350,7 @@ class BalanceController:
         is_fixed = np.repeat(self._sole_share > 0.0, 3)
         entries[assembly.diagonal_entries] += _PIN_STIFFNESS * entries.max() * is_fixed
         factors = MultifrontalLdl(assembly.upper_pattern, assembly.analysis)
-        factors.update(entries)
+        factors.factor(entries)
         loads = np.stack([np.kron(body.node_mass, axis) for axis in axes[:2]], axis=1)
         bent = factors.solve(loads * ~is_fixed[:, None]).reshape(len(body.node_mass), 3, 2)
         arms = self._standing - body.centre_of_mass(self._standing)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
@@ -42,16 +43,16 @@ def shortening(muscles: MuscleSet, start: np.ndarray, end: np.ndarray) -> np.nda
     return segment_vectors(rows, start)[1] - segment_vectors(rows, end)[1]
 
 
-def force_length_factor(shortened: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return phi, its integral from 0 and its derivative, each (M,), at relative lengths ``shortened`` (M,).
+def force_length_factor(shortened: Any) -> tuple[Any, Any, Any]:
+    """Return phi, its integral from 0 and its derivative at relative lengths ``shortened``, a NumPy array or a tensor.
 
     A strongly shortened muscle exerts less force: the ascending limb of the force-length relation (Gordon, Huxley and
     Julian 1966), here a smooth step from ``LENGTH_ZERO_FORCE`` to ``LENGTH_FULL_FORCE``. With a constant tension, two
     ends could be pulled into one point, where the force has no direction and the step has no solution.
     """
     width = LENGTH_FULL_FORCE - LENGTH_ZERO_FORCE
-    along = np.clip((shortened - LENGTH_ZERO_FORCE) / width, 0.0, 1.0)
-    integral = width * along**3 * (1.0 - 0.5 * along) + np.maximum(shortened - LENGTH_FULL_FORCE, 0.0)
+    along = ((shortened - LENGTH_ZERO_FORCE) / width).clip(0.0, 1.0)
+    integral = width * along**3 * (1.0 - 0.5 * along) + (shortened - LENGTH_FULL_FORCE).clip(0.0, None)
     return along**2 * (3.0 - 2.0 * along), integral, 6.0 * along * (1.0 - along) / width
 
 

@@ -91,11 +91,11 @@ def solved_together(
     if few:
         near &= torch.arange(near.shape[1]) % 3 == 0
     contacts = detector.contacts(near, *begun)
-    assert problem.factor(problem.rigid_guess(), None).all()
+    assert problem.factor(problem.rigid_guess, None).all()
     touched, made = beside.solve(
         *(problem, contacts, beside.linearize(problem, contacts)),
         *(torch.from_numpy(creature.muscles.stiffness * activations), torch.tensor(FRICTIONS, dtype=torch.float64)),
-        velocities=problem.rigid_guess(),
+        velocities=problem.rigid_guess,
         forces=torch.zeros((count, contacts.capacity, 3), dtype=torch.float64),
         start_gaps=begun,
     )

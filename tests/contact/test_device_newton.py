@@ -10,7 +10,7 @@ pytest.importorskip("torch")
 from egs_warp.contact.device_newton import DeviceContactLinearizer
 from egs_warp.contact.newton import ContactLinearization, NewtonIterate
 from egs_warp.contact.newton_convergence import NewtonProgress
-from egs_warp.fem import dense_cholesky
+from egs_warp.fem import tiled_cholesky
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.stepper import LocomotionStepper
@@ -127,7 +127,7 @@ def test_nan_of_an_earlier_step_is_ignored(creature: Creature, device: str, monk
             room._base,
             room._trial,
             room._force_velocities,
-            respond.momentum_projection,
+            respond.factors.rotation_operator,
         ):
             part.fill_(np.nan)
         found = respond.predict_velocities(tangent, contacts, tension, problem.rigid_guess, forces)
@@ -217,7 +217,7 @@ def test_a_tangent_whose_sum_is_indefinite_equals_the_host_s(
         .line_search_point(2.0 * forces)
     )
     monkeypatch.setattr(
-        dense_cholesky._InverseFactor, "add_low_rank", lambda root, directions, sign: 0.0 * directions[0, 0]
+        tiled_cholesky._InverseFactor, "add_low_rank", lambda root, directions, sign: 0.0 * directions[0, 0]
     )
     found = place.with_new_tangent()
     # The sum has not been synchronised before.

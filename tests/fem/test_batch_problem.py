@@ -81,8 +81,8 @@ def test_initial_values_of_a_step(body: SoftBody, beside: BatchProblem, alone: l
     same(beside.rotation_modes, [one.rotation_modes for one in alone])
     same(beside.momenta, [one.momenta for one in alone])
     same(beside.inverse_inertia, [np.linalg.inv(one.inertia) for one in alone])
-    same(beside.rigid_guess()[:2], [one.rigid_guess for one in alone[:2]])
-    assert np.abs(beside.rigid_guess()[2].numpy()).max() < 1e-12
+    same(beside.rigid_guess[:2], [one.rigid_guess for one in alone[:2]])
+    assert np.abs(beside.rigid_guess[2].numpy()).max() < 1e-12
     centres = [body.centre_of_mass(one.state.positions) for one in alone]
     same(beside.body.centre(beside.positions), centres)
 

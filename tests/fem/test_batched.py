@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from egs_warp.fem.batched import BatchedRecord, nonzero, repeat_bounds, repeat_offsets
+from egs_warp.fem.batched import BatchedRecord, nonzero, repeat_offsets
 
 CPU = torch.device("cpu")
 
@@ -55,5 +55,4 @@ def test_copies_of_an_index_map_are_concatenated() -> None:
         [10, 12],
         [-1, 11],
     ]
-    assert repeat_bounds(np.array([0, 2, 7]), 3, CPU).tolist() == [0, 2, 7, 9, 14, 16, 21]
     assert nonzero(torch.tensor([False, True, True])).tolist() == [1, 2]

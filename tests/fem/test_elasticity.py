@@ -159,3 +159,8 @@ def test_moduli_of_a_material() -> None:
         mu, lam = material.mu, material.lam
         assert mu * (3.0 * lam + 2.0 * mu) / (lam + mu) == pytest.approx(3.0)
         assert lam / (2.0 * (lam + mu)) == pytest.approx(nu)
+
+
+def test_a_cpu_gets_sparse_factors_and_a_gpu_dense_ones(device: str) -> None:
+    solver = ElasticAssembly(block_mesh(), MATERIAL, device=device).new_solver()
+    assert type(solver).__name__ == ("MultifrontalLdl" if device == "cpu" else "TiledCholesky")

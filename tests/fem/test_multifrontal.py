@@ -10,6 +10,7 @@ from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.fem.multifrontal import MultifrontalLdl, SymbolicFactorization, inverse_and_positives
 from egs_warp.launching import THREADS
+from tests.support.factors import has_factors, is_definite
 from tests.support.sparse_patterns import PATTERNS, upper_of
 
 
@@ -29,8 +30,8 @@ def test_one_and_many_right_sides(shift: float) -> None:
     negative = int((np.linalg.eigvalsh(dense) < 0.0).sum())
     assert (negative == 0) == (shift > 10.0)
     factors = MultifrontalLdl(upper)
-    assert factors.update(upper.data) == (negative == 0)
-    assert factors.is_ready and factors.negative_pivots == negative
+    assert is_definite(factors, upper.data) == (negative == 0)
+    assert has_factors(factors) and factors.negative_pivots == negative
     right = np.random.default_rng(4).standard_normal((60, 7))
     assert np.abs(dense @ factors.solve(right) - right).max() < 1e-9
     assert np.abs(dense @ factors.solve(right[:, 0]) - right[:, 0]).max() < 1e-9
@@ -38,17 +39,17 @@ def test_one_and_many_right_sides(shift: float) -> None:
     # An empty term does not change definiteness.
     assert factors.add_low_rank(np.zeros((60, 0)), np.zeros(0)) == (negative == 0)
     # A matrix with the same pattern.
-    assert factors.update(2.0 * upper.data) == (negative == 0)
+    assert is_definite(factors, 2.0 * upper.data) == (negative == 0)
     assert np.abs(2.0 * dense @ factors.solve(right) - right).max() < 1e-9
 
 
 def test_singular_matrices_are_reported() -> None:
     upper = upper_of(random_matrix(60, 12.0))
     factors = MultifrontalLdl(upper)
-    assert not factors.update(np.full(upper.nnz, np.nan)) and not factors.is_ready
+    assert not is_definite(factors, np.full(upper.nnz, np.nan)) and not has_factors(factors)
     singular = sparse.csc_matrix(np.ones((2, 2)))
     factors = MultifrontalLdl(upper_of(singular))
-    assert not factors.update(np.ones(3)) and not factors.is_ready
+    assert not is_definite(factors, np.ones(3)) and not has_factors(factors)
 
 
 @pytest.mark.parametrize("name", PATTERNS)
@@ -57,7 +58,7 @@ def test_every_pattern_and_number_of_right_sides(name: str) -> None:
     except for a single one."""
     matrix = PATTERNS[name]
     factors, count = MultifrontalLdl(upper_of(matrix)), len(matrix.indptr) - 1
-    assert factors.update(upper_of(matrix).data) and factors.negative_pivots == 0
+    assert is_definite(factors, upper_of(matrix).data) and factors.negative_pivots == 0
     right = np.random.default_rng(5).standard_normal((count, 70))
     whole = factors.solve(right)
     assert np.abs(matrix @ whole - right).max() < 1e-12 * np.abs(right).max() * count
@@ -73,16 +74,16 @@ def strained(factors: LinearSolver, upper: sparse.csc_matrix, vectors: np.ndarra
     """Return the quadratic model of random input with the factored matrix's pattern."""
     random = np.random.default_rng(6)
     slope, weights, away = random.standard_normal((3, len(vectors)))
-    return factors.effort_quadratic(upper.data, slope, weights, vectors, dt_now=0.3, dt_ahead=-0.7, reference=away)
+    return factors.quadratic_form(upper.data, slope, weights, vectors, dt_now=0.3, dt_ahead=-0.7, reference=away)
 
 
 @pytest.mark.parametrize("name", PATTERNS)
-def test_effort_quadratic_equals_dense_algebra(name: str) -> None:
+def test_quadratic_form_equals_dense_algebra(name: str) -> None:
     """X^T H X and X^T g are those of X = 0.3 V - 0.7 S^-1 diag(w) V, minus the reference in the last column of X, for
     another matrix H with the same pattern."""
     matrix = PATTERNS[name]
     factors = MultifrontalLdl(upper_of(matrix))
-    factors.update(upper_of(matrix).data)
+    factors.factor(upper_of(matrix).data)
     other = sparse.csc_matrix(matrix - 0.3 * sparse.diags(matrix.diagonal()))
     for width in (1, 4, 8, 13, 16, 41):
         vectors = np.random.default_rng(5).standard_normal((len(matrix.indptr) - 1, width))
@@ -102,7 +103,7 @@ def test_solutions_conserve_the_angular_momentum(added: bool) -> None:
     matrix = PATTERNS["grid of nodes"]
     count, random = len(matrix.indptr) - 1, np.random.default_rng(8)
     factors = MultifrontalLdl(upper_of(matrix))
-    factors.update(upper_of(matrix).data)
+    factors.factor(upper_of(matrix).data)
     if added:
         assert factors.add_low_rank(random.standard_normal((count, 4)), np.ones(4))
     turns, mass, ratio = random.standard_normal((count, 3)), random.uniform(1.0, 2.0, (count, 1)), 1.1
@@ -121,7 +122,7 @@ def test_sparse_right_hand_sides() -> None:
     matrix = PATTERNS["grid of nodes"]
     count = len(matrix.indptr) - 1
     factors = MultifrontalLdl(upper_of(matrix))
-    factors.update(upper_of(matrix).data)
+    factors.factor(upper_of(matrix).data)
     right = np.eye(count)[:, [0, 1, 7, count // 2, count - 1]]
     np.testing.assert_allclose(factors.solve(right), np.linalg.solve(matrix.toarray(), right), atol=1e-13)
 
@@ -132,7 +133,7 @@ def test_the_same_bits_on_any_number_of_cores(monkeypatch: pytest.MonkeyPatch) -
     for threads in ("1", "2"):
         monkeypatch.setenv(THREADS, threads)
         factors = MultifrontalLdl(upper_of(matrix))
-        factors.update(upper_of(matrix).data)
+        factors.factor(upper_of(matrix).data)
         found.append((factors.solve(right), *strained(factors, upper_of(matrix), right)))
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -144,10 +145,10 @@ def test_solvers_with_a_shared_analysis_have_their_own_factors() -> None:
     analysis, right = SymbolicFactorization.of(upper), np.random.default_rng(5).standard_normal((60, 3))
     shared = [MultifrontalLdl(upper, analysis) for _ in range(2)]
     for scale, factors in zip((1.0, 3.0), shared, strict=True):
-        assert factors.update(scale * upper.data)
+        assert is_definite(factors, scale * upper.data)
     for scale, factors in zip((1.0, 3.0), shared, strict=True):
         alone = MultifrontalLdl(upper)
-        assert alone.update(scale * upper.data)
+        assert is_definite(alone, scale * upper.data)
         assert np.array_equal(factors.solve(right), alone.solve(right))
 
 
@@ -166,13 +167,13 @@ def test_a_negligible_pivot_has_no_factors() -> None:
             changed = matrix.copy()
             changed[last, last] = schur + share * matrix[last, last]
             data = upper_of(sparse.csc_matrix(np.where(changed == 0.0, 1e-300, changed))).data
-            assert not factors.update(data) and factors.is_ready == ready
+            assert not is_definite(factors, data) and has_factors(factors) == ready
             if ready:
                 assert factors.negative_pivots == 1
                 np.testing.assert_allclose(
                     changed @ factors.solve(matrix[:, :3]), matrix[:, :3], atol=1e-9 * matrix.max()
                 )
-    assert factors.update(whole.data)
+    assert is_definite(factors, whole.data)
 
 
 @pytest.mark.parametrize("size", [2, 7, 60])

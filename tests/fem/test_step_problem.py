@@ -12,11 +12,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState, SoftBody, make_body
+from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.geometry.plane import Plane
 from egs_warp.muscles.muscle_set import automatic_muscles
 from egs_warp.muscles.tension import MuscleEnergy
+from tests.support.factors import is_definite
 from tests.support.meshes import block_mesh
 from tests.support.passive import passive_body
 from tests.support.states import bent_state, spinning_state
@@ -107,7 +109,7 @@ def test_an_indefinite_stiffness_is_projected_and_keeps_the_momenta(
     problem, factors = StepProblem(body, squashed, 1.0), MultifrontalLdl(body.assembly.upper_pattern)
     entries = body.assembly.hessian_entries(squashed.positions, problem.damping, factor=1.0)
     entries[body.assembly.diagonal_entries] += np.repeat(body.node_mass, 3)
-    assert not factors.update(entries)
+    assert not is_definite(factors, entries)
     tangent = problem.tangent(factors, squashed.velocities, tension if muscles else None)
     assert factors.negative_pivots == 0
     impulses = np.random.default_rng(7).standard_normal((squashed.velocities.size, 3))
@@ -120,7 +122,7 @@ def test_only_queued_factors_without_a_result_are_replaced() -> None:
     near: list[np.ndarray] = []
     problem: Any = SimpleNamespace(factor_near=lambda factors, velocities: near.append(velocities))
     velocities = np.zeros((4, 3))
-    queued, ready = (SimpleNamespace(is_ready=is_ready) for is_ready in (False, True))
+    queued, ready = (SimpleNamespace(status=status) for status in (FactorStatus.NONE, FactorStatus.DEFINITE))
     given: list[tuple[Any, np.ndarray | None]] = [(queued, None), (ready, velocities), (queued, velocities)]
     assert [Tangent(problem, *each).wait() for each in given] == [True, True, False]
     assert len(near) == 1 and near[0] is velocities

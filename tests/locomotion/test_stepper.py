@@ -8,12 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.sparse as sparse
-import warp as wp
 
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, SoftBody, make_body
+from egs_warp.fem.elasticity import ElasticAssembly
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.fem.warp_elasticity import WarpElasticity
 from egs_warp.geometry.plane import Plane
@@ -177,15 +176,15 @@ def test_device_factors_give_the_same_hop(device: str, monkeypatch: pytest.Monke
     of sparse factors. The body stands on four feet; with more, rounding decides which points carry the load.
     """
     steps, corners = 10 if device == "cpu" else 30, GRID[[0, 4, 20, 24]]
-    dense_factors = pytest.importorskip("egs_warp.fem.dense_cholesky")
+    dense_factors = pytest.importorskip("egs_warp.fem.tiled_cholesky")
     expected, _ = run_hop(muscular_block(feet=corners), steps)
     made: list[object] = []
 
-    def dense(_: wp.Device, pattern: sparse.csc_matrix) -> object:
-        made.append(dense_factors.DenseCholesky(pattern, device=device))
+    def dense(assembly: ElasticAssembly) -> object:
+        made.append(dense_factors.TiledCholesky(assembly.upper_pattern, device=device))
         return made[-1]
 
-    monkeypatch.setattr("egs_warp.locomotion.stepper.linear_solver_on", dense)
+    monkeypatch.setattr(ElasticAssembly, "new_solver", dense)
     # The kernels for GPUs also run on a CPU.
     monkeypatch.setattr("egs_warp.fem.elasticity.SimdElasticity", WarpElasticity)
     got, reports = run_hop(muscular_block(device, feet=corners), steps)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from egs_warp.fem.dense_cholesky import DenseCholesky
 from egs_warp.fem.elasticity import ElasticAssembly
+from egs_warp.fem.tiled_cholesky import TiledCholesky
 from egs_warp.fem.warp_elasticity import WarpElasticity
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LocomotionStepper
@@ -18,9 +18,7 @@ def on_device(
     creature: Creature, device: str, patch: pytest.MonkeyPatch, settings: LocomotionSettings | None = None
 ) -> LocomotionStepper:
     """Return a stepper of the ``creature``'s body and muscles on ``device``."""
-    patch.setattr(
-        "egs_warp.locomotion.stepper.linear_solver_on", lambda _, pattern: DenseCholesky(pattern, device=device)
-    )
+    patch.setattr(ElasticAssembly, "new_solver", lambda assembly: TiledCholesky(assembly.upper_pattern, device=device))
     patch.setattr("egs_warp.fem.elasticity.SimdElasticity", WarpElasticity)
     mesh, material = creature.body.assembly.mesh, creature.body.assembly.material
     body = replace(creature.body, assembly=ElasticAssembly(mesh, material, device=device))

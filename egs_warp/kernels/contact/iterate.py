@@ -29,18 +29,6 @@ def select_base_kernel(
 
 
 @wp.kernel
-def invert_momentum_matrix_kernel(
-    # In:
-    ratio: real,
-    momenta: wp.array[Mat33],
-    # Out:
-    inverse_out: wp.array[Mat33],
-):
-    """Invert ``ratio`` times the angular momenta (3 x 3) of the responses to the three rigid rotations."""
-    inverse_out[0] = wp.inverse(ratio * momenta[0])
-
-
-@wp.kernel
 def trial_kernel(
     # Model:
     starts: wp.array[Vec3],

@@ -7,7 +7,12 @@ addresses of host arrays.
 import warp as wp
 
 from egs_warp.kernels.fem.elasticity_cpu import Elements, MuscleSegments, gradient_native
-from egs_warp.kernels.fem.supernodal import Fronts, MomentumProjection, solve_vector_native
+from egs_warp.kernels.fem.supernodal import (
+    Fronts,
+    MomentumProjection,
+    project_vector_native,
+    solve_vector_native,
+)
 from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import real
 
@@ -140,7 +145,7 @@ def step_residual(
     on_cpu("""
     const int k = directions;
     const double *const u = (const double*)across, *const z = (const double*)through;
-    const double *const small = (const double*)inverse, *const rhs = (const double*)right_side;
+    const double* const small = (const double*)inverse;
     double *const x = (double*)solved, *const along = scratch.data, *const by = along + k;
     for (int j = 0; j < k; ++j) along[j] = 0.0;
     for (int i = 0; i < unknowns; ++i)
@@ -149,18 +154,11 @@ def step_residual(
         by[a] = 0.0;
         for (int j = 0; j < k; ++j) by[a] += small[a * k + j] * along[j];
     }
-    double missing[3] = {0.0, 0.0, 0.0}, turn[3] = {0.0, 0.0, 0.0};
     for (int i = 0; i < unknowns; ++i) {
         double away = 0.0;
         for (int j = 0; j < k; ++j) away += z[(long long)i * k + j] * by[j];
         x[i] -= away;
-        for (int t = 0; t < 3; ++t)
-            missing[t] += projection.rotation_modes.data[3 * i + t] * rhs[i]
-                - projection.inertia_ratio.data[0] * projection.mode_momenta.data[3 * i + t] * x[i];
     }
-    for (int t = 0; t < 9; ++t) turn[t / 3] += projection.inverse.data[t] * missing[t % 3];
-    for (int i = 0; i < unknowns; ++i)
-        for (int t = 0; t < 3; ++t) x[i] += projection.rotation_response.data[3 * i + t] * turn[t];
 """)
 )
 def add_low_rank(
@@ -169,15 +167,11 @@ def add_low_rank(
     across: wp.uint64,
     through: wp.uint64,
     inverse: wp.uint64,
-    projection: MomentumProjection,
-    right_side: wp.uint64,
     scratch: wp.array[real],
     solved: wp.uint64,
 ) -> None:
-    """Correct the solution of the sparse factors for low-rank terms and momentum.
-
-    ``solved`` (3N,) is the solution for ``right_side`` (3N,) with the factors alone. Woodbury's formula adds a sum of
-    ``directions`` rank-one terms (see ``MultifrontalLdl.add_low_rank``); ``projection`` then restores the momentum.
+    """Correct the solution ``solved`` (3N,) with the sparse factors for the sum of ``directions`` rank-one terms, by
+    Woodbury's formula (see ``MultifrontalLdl.add_low_rank``).
     """
     ...
 
@@ -285,37 +279,12 @@ def newton_kernel(
     """Compute the velocities (3N,) in m/s after a Newton step for the residual ``right_side`` (3N,) in N s, and the
     contact velocities (3n,) there.
     """
-    if directions == 0:
-        solve_vector_native(
-            fronts,
-            blocks,
-            unknowns,
-            factor,
-            inverses,
-            reciprocals,
-            right_side,
-            1,
-            projection,
-            scratch,
-            free_velocities_out,
-        )
-    else:
-        solve_vector_native(
-            fronts,
-            blocks,
-            unknowns,
-            factor,
-            inverses,
-            reciprocals,
-            right_side,
-            1,
-            MomentumProjection(),
-            scratch,
-            free_velocities_out,
-        )
-        add_low_rank(
-            unknowns, directions, across, through, inverse, projection, right_side, scratch, free_velocities_out
-        )
+    solve_vector_native(
+        fronts, blocks, unknowns, factor, inverses, reciprocals, right_side, 1, scratch, free_velocities_out
+    )
+    if directions > 0:
+        add_low_rank(unknowns, directions, across, through, inverse, scratch, free_velocities_out)
+    project_vector_native(unknowns, projection, right_side, 1, free_velocities_out)
     apply_update(
         unknowns,
         contacts,

@@ -1,4 +1,7 @@
-"""Neo-Hookean tetrahedra with objective damping: energy, gradient and Hessian per element, gathered without atomics."""
+"""Neo-Hookean tetrahedra with objective damping: energy, gradient and Hessian per element, gathered without atomics.
+
+The first dimension of a launch is the world; all worlds share the mesh, the material and the muscles.
+"""
 
 import warp as wp
 
@@ -15,9 +18,10 @@ _MAX_SWEEPS = wp.constant(MAX_SWEEPS)
 
 
 @wp.func
-def deformation_gradient(x: wp.array[Vec3], tet: wp.vec4i, rest_inverse: Mat33) -> Mat33:
-    """Return the deformation gradient F of a tetrahedron with nodes ``tet`` at positions ``x``."""
-    edges = wp.matrix_from_cols(x[tet[1]] - x[tet[0]], x[tet[2]] - x[tet[0]], x[tet[3]] - x[tet[0]])
+def deformation_gradient(x: wp.array2d[Vec3], world: int, tet: wp.vec4i, rest_inverse: Mat33) -> Mat33:
+    """Return the deformation gradient F of a tetrahedron with nodes ``tet`` at positions ``x`` of ``world``."""
+    first = x[world, tet[0]]
+    edges = wp.matrix_from_cols(x[world, tet[1]] - first, x[world, tet[2]] - first, x[world, tet[3]] - first)
     return edges * rest_inverse
 
 
@@ -95,7 +99,7 @@ def damping_block(
 
 
 @wp.func
-def write_first_corner(e: int, blocks: wp.array2d[Mat33]):
+def write_first_corner(world: int, e: int, blocks: wp.array3d[Mat33]):
     """Complete the blocks of element ``e``: the blocks below the diagonal by symmetry, the blocks of corner 0 from the
     others.
 
@@ -106,12 +110,12 @@ def write_first_corner(e: int, blocks: wp.array2d[Mat33]):
         row = Mat33()
         for b in range(1, 4):
             if b < a:
-                blocks[e, 4 * a + b] = wp.transpose(blocks[e, 4 * b + a])
-            row -= blocks[e, 4 * a + b]
-        blocks[e, 4 * a] = row
-        blocks[e, a] = wp.transpose(row)
+                blocks[world, e, 4 * a + b] = wp.transpose(blocks[world, e, 4 * b + a])
+            row -= blocks[world, e, 4 * a + b]
+        blocks[world, e, 4 * a] = row
+        blocks[world, e, a] = wp.transpose(row)
         last -= row
-    blocks[e, 0] = last
+    blocks[world, e, 0] = last
 
 
 @wp.kernel
@@ -120,13 +124,13 @@ def deformation_gradients_kernel(
     tets: wp.array[wp.vec4i],
     rest_inverses: wp.array[Mat33],
     # In:
-    positions: wp.array[Vec3],
+    positions: wp.array2d[Vec3],
     # Out:
-    gradients_out: wp.array[Mat33],
+    gradients_out: wp.array2d[Mat33],
 ):
-    """Compute F of each element; one thread per element."""
-    e = wp.tid()
-    gradients_out[e] = deformation_gradient(positions, tets[e], rest_inverses[e])
+    """Compute F of each element; one thread per world and element."""
+    world, e = wp.tid()
+    gradients_out[world, e] = deformation_gradient(positions, world, tets[e], rest_inverses[e])
 
 
 @wp.kernel
@@ -139,33 +143,33 @@ def element_energies_kernel(
     lam: real,
     damping_time: real,
     # In:
-    start_gradients: wp.array[Mat33],
-    positions: wp.array[Vec3],
+    start_gradients: wp.array2d[Mat33],
+    positions: wp.array2d[Vec3],
     dt: real,
     # Out:
-    energies_out: wp.array[real],
-    determinants_out: wp.array[real],
+    energies_out: wp.array2d[real],
+    determinants_out: wp.array2d[real],
 ):
     """Compute the energy of Eq. (5) plus dt times half the dissipated power (none if dt is 0), and det F, of each
     element.
 
     The energy of an inverted element is infinite.
     """
-    e = wp.tid()
-    f = deformation_gradient(positions, tets[e], rest_inverses[e])
+    world, e = wp.tid()
+    f = deformation_gradient(positions, world, tets[e], rest_inverses[e])
     j = wp.determinant(f)
-    determinants_out[e] = j
+    determinants_out[world, e] = j
     if j <= real(0.0):
-        energies_out[e] = real(wp.inf)
+        energies_out[world, e] = real(wp.inf)
     else:
         log_j = wp.log(j)
         density = real(0.5) * mu * (wp.ddot(f, f) - real(3.0)) - mu * log_j + real(0.5) * lam * log_j * log_j
         if dt > real(0.0):
-            f0 = start_gradients[e]
+            f0 = start_gradients[world, e]
             stress = damping_stress(f0, f, dt, mu, lam)
             strain = real(0.5) * (wp.transpose(f) * f - wp.transpose(f0) * f0)
             density += real(0.5) * damping_time * wp.ddot(strain, stress)
-        energies_out[e] = volumes[e] * density
+        energies_out[world, e] = volumes[e] * density
 
 
 @wp.kernel
@@ -178,22 +182,22 @@ def element_gradients_kernel(
     lam: real,
     damping_time: real,
     # In:
-    start_gradients: wp.array[Mat33],
-    positions: wp.array[Vec3],
+    start_gradients: wp.array2d[Mat33],
+    positions: wp.array2d[Vec3],
     dt: real,
     # Out:
-    corner_gradients_out: wp.array2d[Vec3],
+    corner_gradients_out: wp.array3d[Vec3],
 ):
     """Compute minus the elastic and damping force on each corner of each element (no damping if dt is 0)."""
-    e = wp.tid()
-    f = deformation_gradient(positions, tets[e], rest_inverses[e])
+    world, e = wp.tid()
+    f = deformation_gradient(positions, world, tets[e], rest_inverses[e])
     inverse_transpose = wp.transpose(wp.inverse(f))
     log_j = wp.log(wp.determinant(f))
     stress = mu * (f - inverse_transpose) + lam * log_j * inverse_transpose
     if dt > real(0.0):
-        stress += damping_time * (f * damping_stress(start_gradients[e], f, dt, mu, lam))
+        stress += damping_time * (f * damping_stress(start_gradients[world, e], f, dt, mu, lam))
     for a in range(4):
-        corner_gradients_out[e, a] = volumes[e] * (stress * shape_gradient(rest_inverses[e], a))
+        corner_gradients_out[world, e, a] = volumes[e] * (stress * shape_gradient(rest_inverses[e], a))
 
 
 @wp.func
@@ -212,19 +216,19 @@ def segment_forces_kernel(
     length_zero_force: real,
     length_full_force: real,
     # In:
-    tensions: wp.array[real],
-    positions: wp.array[Vec3],
+    tensions: wp.array2d[real],
+    positions: wp.array2d[Vec3],
     # Out:
-    forces_out: wp.array[Vec3],
+    forces_out: wp.array2d[Vec3],
 ):
     """Compute T phi u of each segment (Eq. 7), with phi as in ``muscles.tension.force_length_factor``.
 
-    One warp per segment (on a CPU one thread).
+    One warp per world and segment (on a CPU one thread).
     """
-    segment, lane = wp.tid()
+    world, segment, lane = wp.tid()
     vector = Vec3(real(0.0))
     for slot in range(offsets[segment] + lane, offsets[segment + 1], warp_size()):
-        vector += weights[slot] * positions[nodes[slot]]
+        vector += weights[slot] * positions[world, nodes[slot]]
     vector = sum_lanes(vector)
     length = wp.max(wp.length(vector), real(1e-300))
     along = wp.clamp(
@@ -234,7 +238,7 @@ def segment_forces_kernel(
     )
     length_factor = along * along * (real(3.0) - real(2.0) * along)
     if lane == 0:
-        forces_out[segment] = (tensions[segment] * length_factor / length) * vector
+        forces_out[world, segment] = (tensions[world, segment] * length_factor / length) * vector
 
 
 @wp.kernel
@@ -246,23 +250,26 @@ def gather_forces_kernel(
     segment_from_end: wp.array[int],
     end_weights: wp.array[real],
     # In:
-    corner_values: wp.array2d[Vec3],
-    forces: wp.array[Vec3],
+    corner_values: wp.array3d[Vec3],
+    forces: wp.array2d[Vec3],
     # Out:
-    node_values_out: wp.array[Vec3],
+    node_values_out: wp.array2d[Vec3],
 ):
-    """Sum the values of each node's corners and, if there are muscles, of its segment ends; one warp per node."""
-    node, lane = wp.tid()
+    """Sum the values of each node's corners and, if there are muscles, of its segment ends.
+
+    One warp per world and node.
+    """
+    world, node, lane = wp.tid()
     total = Vec3(real(0.0))
     for slot in range(corner_offsets[node] + lane, corner_offsets[node + 1], warp_size()):
         corner = corner_from_slot[slot]
-        total += corner_values[corner // 4, corner % 4]
+        total += corner_values[world, corner // 4, corner % 4]
     if end_offsets.shape[0] > 0:
         for slot in range(end_offsets[node] + lane, end_offsets[node + 1], warp_size()):
-            total += end_weights[slot] * forces[segment_from_end[slot]]
+            total += end_weights[slot] * forces[world, segment_from_end[slot]]
     total = sum_lanes(total)
     if lane == 0:
-        node_values_out[node] = total
+        node_values_out[world, node] = total
 
 
 @wp.kernel
@@ -275,25 +282,25 @@ def element_hessians_kernel(
     lam: real,
     damping_time: real,
     # In:
-    start_gradients: wp.array[Mat33],
-    positions: wp.array[Vec3],
+    start_gradients: wp.array2d[Mat33],
+    positions: wp.array2d[Vec3],
     dt: real,
     # Out:
-    blocks_out: wp.array2d[Mat33],
+    blocks_out: wp.array3d[Mat33],
 ):
     """Compute the Hessian of Eq. (5) for each element.
 
     Block (a, b) = V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T], h = F^-T g. The Hessian of the
     damping (Eq. 6) over a step of dt is added if dt is not 0.
     """
-    e = wp.tid()
+    world, e = wp.tid()
     rest_inverse = rest_inverses[e]
-    f = deformation_gradient(positions, tets[e], rest_inverse)
+    f = deformation_gradient(positions, world, tets[e], rest_inverse)
     inverse_transpose = wp.transpose(wp.inverse(f))
     cross_term = mu - lam * wp.log(wp.determinant(f))
     stress = Mat33()
     if dt > real(0.0):
-        stress = damping_stress(start_gradients[e], f, dt, mu, lam)
+        stress = damping_stress(start_gradients[world, e], f, dt, mu, lam)
     stretch = f * wp.transpose(f)
     for a in range(1, 4):
         g_a = shape_gradient(rest_inverse, a)
@@ -311,8 +318,8 @@ def element_hessians_kernel(
             if dt > real(0.0):
                 rotation_term = wp.dot(g_a, stress * g_b)
                 block += damping_time * damping_block(stretch, f_a, f * g_b, along, rotation_term, dt, mu, lam)
-            blocks_out[e, 4 * a + b] = volumes[e] * block
-    write_first_corner(e, blocks_out)
+            blocks_out[world, e, 4 * a + b] = volumes[e] * block
+    write_first_corner(world, e, blocks_out)
 
 
 @wp.kernel
@@ -325,11 +332,11 @@ def element_projected_hessians_kernel(
     lam: real,
     damping_time: real,
     # In:
-    start_gradients: wp.array[Mat33],
-    positions: wp.array[Vec3],
+    start_gradients: wp.array2d[Mat33],
+    positions: wp.array2d[Vec3],
     dt: real,
     # Out:
-    blocks_out: wp.array2d[Mat33],
+    blocks_out: wp.array3d[Mat33],
 ):
     """Compute element Hessians with negative eigenvalues set to zero, by the eigensystem of an isotropic energy.
 
@@ -338,9 +345,9 @@ def element_projected_hessians_kernel(
     2019). For Eq. (5) these are mu + (lambda ln J - mu)/(s_i s_k) and mu - (lambda ln J - mu)/(s_i s_k). Only
     the semi-definite part of the damping is added, without the term from the derivative of F.
     """
-    e = wp.tid()
+    world, e = wp.tid()
     rest_inverse = rest_inverses[e]
-    f = deformation_gradient(positions, tets[e], rest_inverse)
+    f = deformation_gradient(positions, world, tets[e], rest_inverse)
     v, squares = principal_axes(wp.transpose(f) * f)
     s = Vec3(wp.sqrt(squares[0]), wp.sqrt(squares[1]), wp.sqrt(squares[2]))
     u = f * v * wp.diag(Vec3(real(1.0) / s[0], real(1.0) / s[1], real(1.0) / s[2]))
@@ -378,8 +385,8 @@ def element_projected_hessians_kernel(
             if dt > real(0.0):
                 along = wp.dot(rest_a, rest_b)
                 block += damping_time * damping_block(stretch, f * rest_a, f * rest_b, along, real(0.0), dt, mu, lam)
-            blocks_out[e, 4 * a + b] = volumes[e] * block
-    write_first_corner(e, blocks_out)
+            blocks_out[world, e, 4 * a + b] = volumes[e] * block
+    write_first_corner(world, e, blocks_out)
 
 
 @wp.kernel
@@ -389,19 +396,20 @@ def gather_matrix_kernel(
     block_from_contribution: wp.array[int],
     entry_from_block: wp.array2d[int],
     # In:
-    blocks: wp.array2d[Mat33],
+    blocks: wp.array3d[Mat33],
     factor: real,
     # Out:
-    entries_out: wp.array[real],
+    entries_out: wp.array2d[real],
 ):
-    """Compute the upper entries of ``factor`` times the sum of the elements' blocks; one thread per 3x3 block."""
-    block_index = wp.tid()
+    """Compute the upper entries of ``factor`` times the sum of the elements' blocks; one thread per world and 3x3
+    block."""
+    world, block_index = wp.tid()
     total = Mat33()
     for slot in range(contribution_offsets[block_index], contribution_offsets[block_index + 1]):
         source = block_from_contribution[slot]
-        total += factor * blocks[source // 16, source % 16]
+        total += factor * blocks[world, source // 16, source % 16]
     for i in range(3):
         for k in range(3):
             entry = entry_from_block[block_index, 3 * i + k]
             if entry >= 0:
-                entries_out[entry] = total[i, k]
+                entries_out[world, entry] = total[i, k]

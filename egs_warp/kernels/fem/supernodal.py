@@ -386,16 +386,7 @@ def solve_panel_native(
             for (int i = 0; i < nb; ++i) own[i] = c[i >> 2][i & 3];
         }
     }
-    double missing[3] = {0.0, 0.0, 0.0}, by[3] = {0.0, 0.0, 0.0};
-    for (int i = 0; i < unknowns; ++i) {
-        out[i] = x[fronts.permutation.data[i]];
-        for (int t = 0; t < 3 && projection.enabled; ++t)
-            missing[t] += projection.rotation_modes.data[3 * i + t] * rhs[i * row_stride]
-                - projection.inertia_ratio.data[0] * projection.mode_momenta.data[3 * i + t] * out[i];
-    }
-    for (int t = 0; t < 9 && projection.enabled; ++t) by[t / 3] += projection.inverse.data[t] * missing[t % 3];
-    for (int i = 0; i < unknowns && projection.enabled; ++i)
-        for (int t = 0; t < 3; ++t) out[i] += projection.rotation_response.data[3 * i + t] * by[t];
+    for (int i = 0; i < unknowns; ++i) out[i] = x[fronts.permutation.data[i]];
 """
     )
 )
@@ -408,11 +399,31 @@ def solve_vector_native(
     reciprocals: wp.array[real],
     right: wp.uint64,
     row_stride: wp.int32,
-    projection: MomentumProjection,
     workspace: wp.array[real],
     solution: wp.uint64,
 ) -> None:
     """Solve for a single right-hand side (n,); arguments as for ``solve_panel_native``, ``solution`` is contiguous."""
+    ...
+
+
+@wp.func_native(
+    on_cpu("""
+    const double* const rhs = (const double*)right;
+    double *const x = (double*)solution, missing[3] = {0.0, 0.0, 0.0}, by[3] = {0.0, 0.0, 0.0};
+    if (!projection.enabled) return;
+    for (int i = 0; i < unknowns; ++i)
+        for (int t = 0; t < 3; ++t)
+            missing[t] += projection.rotation_modes.data[3 * i + t] * rhs[i * row_stride]
+                - projection.inertia_ratio.data[0] * projection.mode_momenta.data[3 * i + t] * x[i];
+    for (int t = 0; t < 9; ++t) by[t / 3] += projection.inverse.data[t] * missing[t % 3];
+    for (int i = 0; i < unknowns; ++i)
+        for (int t = 0; t < 3; ++t) x[i] += projection.rotation_response.data[3 * i + t] * by[t];
+""")
+)
+def project_vector_native(
+    unknowns: wp.int32, projection: MomentumProjection, right: wp.uint64, row_stride: wp.int32, solution: wp.uint64
+) -> None:
+    """Apply the ``projection``, if it is enabled, to the ``solution`` (n,) for ``right``."""
     ...
 
 
@@ -459,8 +470,9 @@ def solve_kernel(
     """
     if count == 1:
         solve_vector_native(
-            fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, projection, workspace, solution
+            fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, workspace, solution
         )
+        project_vector_native(unknowns, projection, right, row_stride, solution)
         return
     panel = claim_next(counters, 0)
     while PANEL * panel < count:
@@ -498,7 +510,7 @@ def effort_panel_kernel(
     linear: wp.array2d[real],
     quadratic: wp.array2d[real],
 ) -> None:
-    """Compute the quadratic model of the elastic energy (``LinearSolver.effort_quadratic``).
+    """Compute the quadratic model of the elastic energy (``LinearSolver.quadratic_form``).
 
     Each panel gives the displacements X (``moves``), their ``products`` H X and the terms ``linear`` X^T g. The blocks
     of ``quadratic`` X^T H X follow after all panels. Several launches may share the work through ``counters`` (3,):

@@ -2,7 +2,7 @@
 
 Tasks are taken in order and none depends on a later one, so any number of blocks makes progress, regardless of when
 each of them starts. Every sum has a fixed order, so results do not depend on the number of blocks. Host code:
-``egs_warp.fem.tiled_inverse``; task lists: ``egs_warp.fem.tile_tasks``.
+``egs_warp.fem.tiled_cholesky``; task lists: ``egs_warp.fem.tile_tasks``.
 """
 
 from enum import IntEnum

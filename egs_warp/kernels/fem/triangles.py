@@ -1,8 +1,8 @@
-"""Inverses of small lower triangular matrices: on a GPU one thread block each, on a CPU one thread."""
+"""Inverses of small matrices: of lower triangular ones, on a GPU by one thread block each, and of a 3 x 3 matrix."""
 
 import warp as wp
 
-from egs_warp.precision import real
+from egs_warp.precision import Mat33, real
 
 wp.set_module_options({"enable_backward": False})
 
@@ -83,3 +83,15 @@ def invert_triangles_kernel(
     """
     block, _lane = wp.tid()
     invert_triangle(lower, side, block, inverse_out)
+
+
+@wp.kernel
+def invert_momentum_matrix_kernel(
+    # In:
+    ratio: real,
+    momenta: wp.array[Mat33],
+    # Out:
+    inverse_out: wp.array[Mat33],
+):
+    """Invert ``ratio`` times the angular momenta (3 x 3) of the responses to the three rigid rotations."""
+    inverse_out[0] = wp.inverse(ratio * momenta[0])

@@ -1,4 +1,7 @@
-"""Kernel that computes the start of a step on a GPU: lever arms, rigid modes, inverse inertia and the rigid guess."""
+"""Kernel that computes the start of a step on a GPU: lever arms, rigid modes, inverse inertia and the rigid guess.
+
+Its first launch dimension is the world.
+"""
 
 import warp as wp
 
@@ -43,26 +46,26 @@ def step_start_kernel(
     dt: real,
     masses: wp.array[real],
     # In:
-    positions: wp.array[Vec3],
-    velocities: wp.array[Vec3],
+    positions: wp.array2d[Vec3],
+    velocities: wp.array2d[Vec3],
     # Out:
-    arms_out: wp.array[Vec3],
-    modes_out: wp.array2d[real],
+    arms_out: wp.array2d[Vec3],
+    modes_out: wp.array3d[real],
     inverse_inertia_out: wp.array[Mat33],
-    guess_out: wp.array[Vec3],
+    guess_out: wp.array2d[Vec3],
 ):
-    """Compute ``lever_arms``, ``rotation_modes`` (3N, 3), ``inverse_inertia`` (1,) and ``rigid_guess`` of
-    ``StepProblem`` for a step of ``dt`` seconds, in one block of threads, or one thread on a CPU.
+    """Compute ``lever_arms`` (B, N), ``rotation_modes`` (B, 3N, 3), ``inverse_inertia`` (B,) and ``rigid_guess`` (B, N)
+    of ``StepProblem`` for steps of ``dt`` seconds; one block of threads per world, or one thread on a CPU.
     """
-    lane = wp.tid()
+    world, lane = wp.tid()
     count = masses.shape[0]
     mass = real(0.0)
     weighted_position = Vec3()
     momentum = Vec3()
     for node in range(lane, count, wp.block_dim()):
         mass += masses[node]
-        weighted_position += masses[node] * positions[node]
-        momentum += masses[node] * velocities[node]
+        weighted_position += masses[node] * positions[world, node]
+        momentum += masses[node] * velocities[world, node]
     mass = sum_of_block(mass)
     sync_block()
     centre = block_sum(weighted_position) / mass
@@ -71,18 +74,18 @@ def step_start_kernel(
     products = Vec3()
     spin = Vec3()
     for node in range(lane, count, wp.block_dim()):
-        arm = positions[node] - centre
+        arm = positions[world, node] - centre
         m = masses[node]
-        arms_out[node] = arm
+        arms_out[world, node] = arm
         for k in range(3):
             axis = Vec3()
             axis[k] = real(1.0)
             rotation = wp.cross(axis, arm)
             for i in range(3):
-                modes_out[3 * node + i, k] = rotation[i]
+                modes_out[world, 3 * node + i, k] = rotation[i]
         squares += m * wp.cw_mul(arm, arm)
         products += m * Vec3(arm[0] * arm[1], arm[1] * arm[2], arm[2] * arm[0])
-        spin += m * wp.cross(arm, velocities[node])
+        spin += m * wp.cross(arm, velocities[world, node])
     squares = block_sum(squares)
     products = block_sum(products)
     spin = block_sum(spin)
@@ -94,7 +97,7 @@ def step_start_kernel(
         )
     )
     if lane == 0:
-        inverse_inertia_out[0] = inverse_inertia
+        inverse_inertia_out[world] = inverse_inertia
     rotation = dt * (inverse_inertia * spin)
     for node in range(lane, count, wp.block_dim()):
-        guess_out[node] = speed + rotation_displacement(rotation, positions[node] - centre) / dt
+        guess_out[world, node] = speed + rotation_displacement(rotation, positions[world, node] - centre) / dt

@@ -14,28 +14,33 @@ import torch
 import warp as wp
 
 from egs_warp.fem.batched import as_warp
-from egs_warp.fem.cuda_graphs import GraphCache, GraphStream, PinnedUpload
+from egs_warp.fem.cuda_graphs import GraphStream
 from egs_warp.fem.dissection import Dissection
+from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.momentum_projection import MomentumProjection
-from egs_warp.fem.tiled_inverse import TiledInverseFactor
+from egs_warp.fem.tile_tasks import TileTaskGraph
 from egs_warp.kernels.fem import triangles as kernels
-from egs_warp.precision import real
+from egs_warp.kernels.fem.tiled_inverse import BLOCK, TILE_SIDE, tiled_inverse_kernel
+from egs_warp.precision import Mat33, real
+
+_PROCESSOR_FRACTION = 10 / 11
+"""Fraction of a GPU's multiprocessors that the kernel occupies; the others are free for concurrent work."""
 
 
-class DenseCholesky:
+class TiledCholesky:
     """Dense Cholesky solver for symmetric matrices of one pattern; implements ``LinearSolver``.
 
     The inverse factor L^-1 is computed once per matrix. A triangular solve takes the same time for one right-hand side
     as for a thousand, and a product with L^-1 takes a fiftieth of that time.
     """
 
-    is_host = False
+    is_asynchronous = True
 
     def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array, *, device: str) -> None:
         """Allocate the solver.
 
         Args:
-            upper_pattern: (n, n) upper triangle with the diagonal, entries in the order of ``update``.
+            upper_pattern: (n, n) upper triangle with the diagonal, entries in the order of ``factor``.
             device: PyTorch device.
         """
         count = len(upper_pattern.indptr) - 1
@@ -55,20 +60,23 @@ class DenseCholesky:
         """(2,) on the host and on the device: nonzero if the entries are finite, and if the matrix is positive
         definite."""
         self._factored = self.stream.run_captured(self._factor)
-        self._effort_upload, self._effort_entries = (
-            PinnedUpload(self.stream, 3 * count),
-            torch.zeros_like(self._entries),
+        self.rotation_response, self.rotation_operator = (
+            self._energy_hessian.new_zeros(shape) for shape in ((count, 3), (3, count))
         )
-        self._effort_readback, self._effort_graphs = self.stream.pinned(0), GraphCache(self.stream)
-        self._finite = self._ready = self._pending = False
+        """(n, 3) and (3, n) of the momentum projection: their product times a right-hand side is added to its
+        solution."""
+        self._momentum_matrices = self._energy_hessian.new_zeros(2, 3, 3)
+        self._half_solved, self._solved = self._energy_hessian.new_zeros(2, count)
+        self._rotation = self._energy_hessian.new_zeros(3)
+        self._finite = self._pending = False
+        self._status = FactorStatus.NONE
 
-    def update(self, entries: np.ndarray | torch.Tensor, diagonal: np.ndarray | None = None) -> bool:
-        """Factor S; see ``LinearSolver.update``. A matrix that is not positive definite has no factors."""
-        self.start_update(entries, diagonal)
-        return self.is_ready
+    def entries_from(self, entries: wp.array) -> torch.Tensor:
+        """Return a copy of ``entries`` on the device; PyTorch must use Warp's stream."""
+        return wp.to_torch(entries).flatten().clone()
 
-    def start_update(self, entries: np.ndarray | torch.Tensor, diagonal: np.ndarray | None = None) -> None:
-        """Factor S asynchronously; see ``LinearSolver.start_update``."""
+    def factor(self, entries: np.ndarray | torch.Tensor, diagonal: np.ndarray | None = None) -> None:
+        """Factor S asynchronously; see ``LinearSolver.factor``. An indefinite matrix has no factors."""
         with self.stream:
             self._entries.copy_(self._to_device(entries))
             self.upload_diagonal(np.zeros(len(self._diagonal)) if diagonal is None else diagonal)
@@ -82,8 +90,8 @@ class DenseCholesky:
             self._uploaded_diagonal = diagonal.copy()
             self._diagonal.copy_(self._to_device(diagonal))
 
-    def enqueue(self, entries: torch.Tensor) -> None:
-        """Queue ``start_update`` with the uploaded diagonal, as part of a graph.
+    def enqueue_factor(self, entries: torch.Tensor) -> None:
+        """Queue ``factor`` with the uploaded diagonal, as part of a graph.
 
         The caller of the graph reports its launch with ``mark_started``.
         """
@@ -91,7 +99,7 @@ class DenseCholesky:
         self._factor()
 
     def enqueue_low_rank(self, directions: torch.Tensor, sign: float) -> None:
-        """Queue the update of the factors from S to S + ``sign`` U^T U; ``verdict`` and ``is_ready`` report the result.
+        """Queue the update of the factors from S to S + ``sign`` U^T U; ``verdict`` and ``status`` report the result.
 
         S must be positive definite. Updates with a negative sign must come last, since their sum may be indefinite.
 
@@ -103,7 +111,7 @@ class DenseCholesky:
         self._verdict_readback.copy_(self.verdict, non_blocking=True)
 
     def mark_started(self) -> None:
-        """Report that factors are queued; ``is_ready`` then waits for them."""
+        """Report that factors are queued; ``status`` then waits for them."""
         self._pending = True
 
     def _factor(self) -> None:
@@ -123,14 +131,14 @@ class DenseCholesky:
         with self.stream:
             if not self._root.factor_with(self._to_device(across), self._to_device(rates)):
                 return False
-        self._ready = True
+        self._status = FactorStatus.DEFINITE
         return True
 
     @property
-    def is_ready(self) -> bool:
-        """True if factors exist; blocks until queued ones are computed."""
+    def status(self) -> FactorStatus:
+        """Status of the factors; blocks until queued ones are computed."""
         self._finish()
-        return self._ready
+        return self._status
 
     def _finish(self) -> None:
         """Wait for queued factors and read their verdict."""
@@ -138,13 +146,14 @@ class DenseCholesky:
             self.stream.wait()
             self._pending = False
             finite, definite = self._verdict_readback.tolist()
-            self._finite, self._ready = finite > 0.0, finite > 0.0 and definite > 0.0
+            self._finite = finite > 0.0
+            self._status = FactorStatus.DEFINITE if self._finite and definite > 0.0 else FactorStatus.NONE
 
     def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
         """Solve for ``right``; see ``LinearSolver.solve``."""
-        assert self.is_ready, "call update() first"
+        assert self.status is FactorStatus.DEFINITE, "call factor() first"
         with self.stream:
-            plain = self._to_host(self._solve(self._to_device(right)))
+            plain = self._to_host(self.enqueue_solve(self._to_device(right)))
         return plain if projection is None else projection.corrected(right, plain)
 
     @property
@@ -152,53 +161,73 @@ class DenseCholesky:
         """(n, n) R with S^-1 = R^T R on the device: L^-1 with permuted unknowns. Its address never changes."""
         return self._root.inverse
 
-    def _solve(self, right: torch.Tensor) -> torch.Tensor:
+    def enqueue_solve(self, right: torch.Tensor) -> torch.Tensor:
+        """Queue S^-1 ``right``."""
         return self.inverse.T @ (self.inverse @ right)
 
-    def effort_quadratic(
+    def enqueue_momentum_projection(
+        self, rotation_modes: torch.Tensor, mode_momenta: torch.Tensor, rotation_response: torch.Tensor, ratio: float
+    ) -> None:
+        """Queue the momentum projection of the current factors; arguments as the fields of ``MomentumProjection``.
+
+        Since S is symmetric, the correction of a solution is a linear function of its right-hand side b: U P b with
+        P = inverse (T - ratio U)^T. One product with P replaces two.
+        """
+        self.rotation_response.copy_(rotation_response)
+        torch.mm(mode_momenta.T, self.rotation_response, out=self._momentum_matrices[0])
+        wp.launch(
+            kernels.invert_momentum_matrix_kernel,
+            1,
+            inputs=[ratio, as_warp(self._momentum_matrices[:1], Mat33)],
+            outputs=[as_warp(self._momentum_matrices[1:], Mat33)],
+            device=wp.device_from_torch(self.device),
+        )
+        torch.mm(
+            self._momentum_matrices[1],
+            rotation_modes.T - ratio * self.rotation_response.T,
+            out=self.rotation_operator,
+        )
+
+    def enqueue_projected_solve(self, right: torch.Tensor) -> torch.Tensor:
+        """Queue S^-1 ``right`` (n, m) with the momentum projection that was queued last."""
+        return self.enqueue_solve(right).addmm_(self.rotation_response, self.rotation_operator @ right)
+
+    def enqueue_vector_solve(self, right: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Queue the solution for one right-hand side without allocations.
+
+        Args:
+            right: (n,).
+
+        Returns:
+            S^-1 ``right`` (n,) and (3,), whose product with ``rotation_response`` must be added to it. The next call
+            overwrites both.
+        """
+        torch.mv(self.inverse, right, out=self._half_solved)
+        torch.mv(self.inverse.T, self._half_solved, out=self._solved)
+        torch.mv(self.rotation_operator, right, out=self._rotation)
+        return self._solved, self._rotation
+
+    def quadratic_form(
         self,
-        entries: np.ndarray,
-        gradient: np.ndarray,
-        weights: np.ndarray,
-        vectors: np.ndarray,
+        entries: np.ndarray | torch.Tensor,
+        gradient: np.ndarray | torch.Tensor,
+        weights: np.ndarray | torch.Tensor,
+        vectors: np.ndarray | torch.Tensor,
         *,
         dt_now: float,
         dt_ahead: float,
-        reference: np.ndarray,
+        reference: np.ndarray | torch.Tensor,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the quadratic model of the elastic energy; see ``LinearSolver.effort_quadratic``."""
-        count = vectors.shape[1]
+        """Compute the quadratic model of the elastic energy; see ``LinearSolver.quadratic_form``."""
         with self.stream:
-            self._effort_upload.set(gradient, weights, reference)
-            self._effort_entries.copy_(self._to_device(entries))
-            columns = self._to_device(vectors)
-            if self._effort_readback.numel() < count * count + count:
-                self._effort_readback = self.stream.pinned(count * count + count)
-                self._effort_graphs.forget()
+            matrix, slope, masses, columns, offset = map(
+                self._to_device, (entries, gradient, weights, vectors, reference)
+            )
+            terms = self.enqueue_quadratic_form(matrix, slope, masses, columns, dt_now, dt_ahead, offset)
+            quadratic, linear = map(self._to_host, terms)
+            return quadratic, linear
 
-            def work() -> None:
-                result = self._effort(columns, dt_now, dt_ahead)
-                self._effort_readback[: len(result)].copy_(result, non_blocking=True)
-
-            if isinstance(vectors, torch.Tensor):
-                self._effort_graphs.run((columns.data_ptr(), count, dt_now, dt_ahead), work)
-            else:
-                # Vectors on the host are uploaded to a different address each time, so no graph is captured.
-                work()
-            self.stream.wait()
-        quadratic, linear = np.split(self._effort_readback.numpy()[: count * count + count], [count * count])
-        return quadratic.reshape(count, count).copy(), linear.copy()
-
-    def _effort(self, vectors: torch.Tensor, dt_now: float, dt_ahead: float) -> torch.Tensor:
-        """Return the quadratic and linear terms for the uploaded input as one flat tensor; not finite if there are no
-        factors."""
-        gradient, weights, reference = self._effort_upload.device.split([len(vectors)] * 3)
-        quadratic, linear = self.enqueue_effort_quadratic(
-            self._effort_entries, gradient, weights, vectors, dt_now, dt_ahead, reference
-        )
-        return torch.cat([quadratic.flatten(), linear])
-
-    def enqueue_effort_quadratic(
+    def enqueue_quadratic_form(
         self,
         entries: torch.Tensor,
         gradient: torch.Tensor,
@@ -208,8 +237,8 @@ class DenseCholesky:
         dt_ahead: float,
         reference: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Queue ``effort_quadratic`` of device tensors, without synchronization."""
-        moves = dt_now * vectors + dt_ahead * self._solve(weights[:, None] * vectors)
+        """Queue ``quadratic_form`` of device tensors, without synchronization."""
+        moves = dt_now * vectors + dt_ahead * self.enqueue_solve(weights[:, None] * vectors)
         moves[:, -1] -= reference
         flat = self._energy_hessian.view(-1)
         flat[self._upper] = entries
@@ -305,6 +334,61 @@ class _InverseFactor:
 
     def _set_inverse(self, inverse: torch.Tensor) -> None:
         torch.index_select(inverse, 1, self._permutation, out=self.inverse)
+
+
+class TiledInverseFactor:
+    """R with S^-1 = R^T R for symmetric matrices S (n, n), computed by one kernel.
+
+    R is L^-1 of S permuted to the order of the dissection, with columns in the order of S.
+    """
+
+    def __init__(
+        self, dissection: Dissection, matrix: torch.Tensor, inverse: torch.Tensor, stream: GraphStream
+    ) -> None:
+        """Allocate the scratch memory.
+
+        Args:
+            dissection: partition of the unknowns.
+            matrix: (n, n) float64, input: the lower triangle of S in the order of the dissection.
+            inverse: (n, n) float64, output: R.
+            stream: stream of the launches.
+        """
+        tasks = TileTaskGraph([len(part) for part in dissection.parts], len(dissection.separator))
+        device, self._stream = matrix.device, stream
+        order = dissection.order.astype(np.int32)
+        permutation = np.empty_like(order)
+        permutation[order] = np.arange(len(order))
+        index_arrays = (
+            torch.from_numpy(values).to(device) for values in (tasks.tasks, tasks.pairs, order, permutation)
+        )
+        self._inputs = [as_warp(matrix, real), *(as_warp(values, wp.int32) for values in index_arrays), tasks.columns]
+        numbers = (
+            torch.zeros(count * TILE_SIDE**2, dtype=torch.float64, device=device)
+            for count in (tasks.tiles, tasks.columns)
+        )
+        flags = (torch.zeros(count, dtype=torch.int32, device=device) for count in (tasks.tiles + tasks.columns, 4))
+        self._inputs += [
+            *(as_warp(values, real) for values in numbers),
+            *(as_warp(values, wp.int32) for values in flags),
+        ]
+        self._definite = torch.zeros(1, dtype=torch.bool, device=device)
+        self._outputs = [as_warp(inverse, real), as_warp(self._definite, wp.bool)]
+        self._device = wp.device_from_torch(device)
+        self._blocks = min(len(tasks.tasks), max(1, int(_PROCESSOR_FRACTION * self._device.sm_count)))
+
+    def factor(self) -> torch.Tensor:
+        """Queue the computation of R of ``matrix``; return a () bool tensor, True if the matrix is positive
+        definite."""
+        wp.launch(
+            tiled_inverse_kernel,
+            (self._blocks, BLOCK),
+            inputs=self._inputs,
+            outputs=self._outputs,
+            device=self._device,
+            stream=self._stream.current(),
+            block_dim=BLOCK,
+        )
+        return self._definite[0]
 
 
 class _TriangularInverse:

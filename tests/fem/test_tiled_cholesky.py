@@ -8,7 +8,6 @@ import scipy.sparse as sparse
 import warp as wp
 
 from egs_warp.fem.dissection import Dissection
-from egs_warp.fem.linear_solver import linear_solver_on
 from egs_warp.fem.multifrontal import MultifrontalLdl
 
 pytest.importorskip("torch")
@@ -16,10 +15,25 @@ pytest.importorskip("torch")
 import torch
 
 from egs_warp.fem.cuda_graphs import GraphStream
-from egs_warp.fem.dense_cholesky import DenseCholesky, _TriangularInverse
+from egs_warp.fem.tiled_cholesky import TiledCholesky, TiledInverseFactor, _TriangularInverse
 from egs_warp.kernels.fem.triangles import MAX_ROWS
+from tests.support.factors import has_factors, is_definite
+from tests.support.slab_matrices import slab_matrix
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
+SIZES = [
+    ([1], 0),
+    ([7], 0),
+    ([64], 0),
+    ([65], 0),
+    ([259], 0),
+    ([1, 1], 1),
+    ([100, 1, 65], 70),
+    ([64, 128], 64),
+    ([200, 190, 210, 150], 129),
+    ([1, 504, 426, 468], 305),
+]
+"""Unknowns of the slabs and of the separator."""
 
 
 def entries_of(upper: sparse.csc_matrix, seed: int, diagonal: float) -> np.ndarray:
@@ -47,18 +61,18 @@ def band(count: int) -> sparse.csc_matrix:
 def test_matrices_of_every_size_are_inverted_by_halves(count: int, device: str) -> None:
     """With an added diagonal, by dense and sparse factors; a NaN is rejected."""
     upper = pattern(count)
-    dense, thin = DenseCholesky(upper, device=device), MultifrontalLdl(upper)
+    dense, thin = TiledCholesky(upper, device=device), MultifrontalLdl(upper)
     random = np.random.default_rng(count)
     right = random.normal(size=(count, 3))
     for seed in range(3):
         entries, diagonal = entries_of(upper, seed, 1.0), 40.0 + random.random(count)
-        assert dense.update(entries, diagonal) and thin.update(entries, diagonal)
+        assert is_definite(dense, entries, diagonal) and is_definite(thin, entries, diagonal)
         half = sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray()
         matrix = half + np.triu(half, 1).T + np.diag(diagonal)
         for factors in (dense, thin):
             assert np.abs(matrix @ factors.solve(right) - right).max() < 1e-11
     entries[-1] = np.nan
-    assert not dense.update(entries, diagonal) and not dense.is_ready and not thin.update(entries, diagonal)
+    assert not any(is_definite(factors, entries, diagonal) for factors in (dense, thin)) and not has_factors(dense)
 
 
 @pytest.mark.parametrize("count", [3, 64, 65, 129, 500, 1704])
@@ -78,14 +92,14 @@ def test_slabs_of_a_long_body_are_factored_at_once(device: str) -> None:
     upper = band(count)
     slabs = Dissection.of(upper)
     assert len(slabs.parts) > 2
-    factors = DenseCholesky(upper, device=device)
+    factors = TiledCholesky(upper, device=device)
     random = np.random.default_rng(0)
     right, across, rates = random.normal(size=(count, 5)), random.normal(size=(count, 3)), np.array([2.0, -0.01, 1.0])
     for seed in range(4):
         entries = entries_of(upper, seed, 12.0)
         half = sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray()
         matrix = half + np.triu(half, 1).T
-        assert factors.update(entries)
+        assert is_definite(factors, entries)
         assert np.abs(matrix @ factors.solve(right) - right).max() < 1e-12
         root = factors.inverse.cpu().numpy()
         np.testing.assert_allclose(root.T @ root, np.linalg.inv(matrix), rtol=0, atol=1e-13)
@@ -95,7 +109,7 @@ def test_slabs_of_a_long_body_are_factored_at_once(device: str) -> None:
     for wrong in (slabs.parts[0][0], slabs.parts[-1][-1], slabs.separator[0]):
         lower = np.zeros(count)
         lower[wrong] = -40.0
-        assert not factors.update(entries, lower) and factors.update(entries)
+        assert not is_definite(factors, entries, lower) and is_definite(factors, entries)
         assert np.abs(matrix @ factors.solve(right) - right).max() < 1e-12
 
 
@@ -106,21 +120,21 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
     dense factors, but its sum with a term may have.
     """
     upper = pattern(60)
-    dense, thin = DenseCholesky(upper, device=device), MultifrontalLdl(upper)
+    dense, thin = TiledCholesky(upper, device=device), MultifrontalLdl(upper)
     random = np.random.default_rng(7)
     right = random.normal(size=(60, 40))
     across, rates = random.normal(size=(60, 8)), 0.1 * random.normal(size=8)
     for seed in range(5):
         entries = entries_of(upper, seed, diagonal)
-        definite = thin.update(entries)
-        assert dense.update(entries) == dense.is_ready == definite == (diagonal == 30.0)
+        definite = is_definite(thin, entries)
+        assert is_definite(dense, entries) == has_factors(dense) == definite == (diagonal == 30.0)
         half = sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray()
         matrix = half + np.triu(half, 1).T
         if definite:
             slope, weights, away = random.normal(size=(3, 60))
             for found, expected in zip(
                 *(
-                    one.effort_quadratic(entries, slope, weights, right, dt_now=0.2, dt_ahead=0.5, reference=away)
+                    one.quadratic_form(entries, slope, weights, right, dt_now=0.2, dt_ahead=0.5, reference=away)
                     for one in (dense, thin)
                 ),
                 strict=True,
@@ -134,7 +148,7 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
             assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
         # A rejected term changes nothing.
         assert not dense.add_low_rank(across, np.full(8, -1e3)) and not thin.add_low_rank(across, np.full(8, -1e3))
-        assert dense.update(entries) == thin.update(entries) == definite
+        assert is_definite(dense, entries) == is_definite(thin, entries) == definite
         if definite:
             assert not dense.add_low_rank(across, np.full(8, -1e3)) and not thin.add_low_rank(across, np.full(8, -1e3))
             assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
@@ -142,7 +156,7 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
         assert (
             dense.add_low_rank(np.eye(60), np.full(60, 40.0))
             and thin.add_low_rank(np.eye(60), np.full(60, 40.0))
-            and dense.is_ready
+            and has_factors(dense)
         )
         assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-10
         assert np.abs((matrix + 40.0 * np.eye(60)) @ dense.solve(right) - right).max() < 1e-10
@@ -153,20 +167,20 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
 def test_low_rank_terms_need_no_new_factorization(count: int, device: str) -> None:
     """Positive, then negative terms; if the sum is indefinite, there are no factors until the next matrix."""
     upper, random = pattern(60), np.random.default_rng(5)
-    factors, right = DenseCholesky(upper, device=device), random.normal(size=(60, 4))
+    factors, right = TiledCholesky(upper, device=device), random.normal(size=(60, 4))
     directions = np.vstack([random.normal(size=(count, 60)), np.zeros((3, 60))])
     for seed, strengths, definite in [(0, (3.0, 0.1), True), (1, (1e3, 0.0), True), (2, (0.1, 90.0), False)]:
         entries = entries_of(upper, seed, 30.0)
         half = sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray()
         matrix = half + np.triu(half, 1).T
         with factors.stream:
-            factors.enqueue(torch.from_numpy(entries).to(device))
+            factors.enqueue_factor(torch.from_numpy(entries).to(device))
             for sign, strength in zip((1.0, -1.0), strengths, strict=True):
                 told = np.sqrt(strength / count) * directions
                 matrix = matrix + sign * told.T @ told
                 factors.enqueue_low_rank(torch.from_numpy(told).to(device), sign)
         factors.mark_started()
-        assert factors.is_ready == definite == (np.linalg.eigvalsh(matrix).min() > 0.0)
+        assert has_factors(factors) == definite == (np.linalg.eigvalsh(matrix).min() > 0.0)
         if definite:
             found = factors.solve(right)
             assert np.abs(matrix @ found - right).max() < 1e-11
@@ -176,30 +190,59 @@ def test_low_rank_terms_need_no_new_factorization(count: int, device: str) -> No
 @pytest.mark.parametrize("device", DEVICES)
 def test_non_finite_matrices_have_no_factors(device: str) -> None:
     upper = pattern(20)
-    factors = DenseCholesky(upper, device=device)
+    factors = TiledCholesky(upper, device=device)
     for value in (np.nan, np.inf):
-        assert not factors.update(np.full(upper.nnz, value)) and not factors.is_ready
-        assert not factors.add_low_rank(np.eye(20), np.ones(20)) and not factors.is_ready
-    assert factors.update(entries_of(upper, 0, 30.0)) and factors.is_ready
+        assert not is_definite(factors, np.full(upper.nnz, value)) and not has_factors(factors)
+        assert not factors.add_low_rank(np.eye(20), np.ones(20)) and not has_factors(factors)
+    assert is_definite(factors, entries_of(upper, 0, 30.0)) and has_factors(factors)
     assert not factors.add_low_rank(np.full((20, 1), np.nan), np.ones(1))
-
-
-@pytest.mark.cuda
-def test_a_gpu_gets_dense_factors() -> None:
-    assert isinstance(linear_solver_on(wp.get_device("cuda:0"), pattern(20)), DenseCholesky)
-
-
-def test_a_cpu_gets_sparse_factors() -> None:
-    assert isinstance(linear_solver_on(wp.get_device("cpu"), pattern(20)), MultifrontalLdl)
 
 
 @pytest.mark.cuda
 def test_factors_keep_temporary_memory_of_warp() -> None:
     """Temporary memory of Warp's sorts on the stream must not be freed, in particular not during a capture."""
     upper = band(150)
-    factors, count = DenseCholesky(upper, device="cuda:0"), 1000
+    factors, count = TiledCholesky(upper, device="cuda:0"), 1000
     for seed in range(3):
         keys, values = (wp.array(np.arange(2 * count)[::-1].astype(np.int32), dtype=int, device="cuda:0") for _ in "kv")
         wp.utils.radix_sort_pairs(keys, values, count)
-        assert factors.update(entries_of(upper, seed, 12.0))
+        assert is_definite(factors, entries_of(upper, seed, 12.0))
         assert np.array_equal(keys.numpy()[:count], np.arange(count, 2 * count))
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize(("parts", "between"), SIZES)
+def test_tiles_make_the_inverse_of_a_factor(parts: list[int], between: int) -> None:
+    """Previous contents of the output do not matter; results are bitwise equal, also after an indefinite matrix and for
+    any number of blocks."""
+    count = sum(parts) + between
+    random = np.random.default_rng(count)
+    order = random.permutation(count)
+    *cuts, _ = np.cumsum([*parts, between])
+    *slabs, rest = np.split(order, cuts)
+    given = slab_matrix(parts, between, seed=count)
+    matrix, inverse = torch.zeros((2, count, count), dtype=torch.float64, device="cuda")
+    tiled = TiledInverseFactor(Dissection(slabs, rest), matrix, inverse, GraphStream(matrix.device))
+
+    def make(entries: np.ndarray) -> bool:
+        inverse.fill_(3.0)
+        matrix.copy_(torch.from_numpy(np.tril(entries)))
+        return bool(tiled.factor())
+
+    assert make(given)
+    root = inverse.cpu().numpy()
+    factor = np.linalg.cholesky(given)
+    expected = np.linalg.inv(factor)
+    np.testing.assert_allclose(root[:, order], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert np.abs(root[:, order].T @ (root[:, order] @ given) - np.eye(count)).max() < 1e-13
+    for wrong, value in ((0, 0.0), (random.integers(count), -50.0), (count - 1, -1e-3), (count - 1, np.nan)):
+        indefinite = given.copy()
+        indefinite[wrong, wrong] = value
+        assert not make(indefinite)
+        for _ in range(5):
+            assert make(given)
+            np.testing.assert_array_equal(inverse.cpu().numpy(), root)
+    for blocks in (1, 7):
+        tiled._blocks = blocks
+        assert make(given)
+        np.testing.assert_array_equal(inverse.cpu().numpy(), root)

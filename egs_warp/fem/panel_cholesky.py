@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
+import numpy as np
+import scipy.sparse as sparse
 import torch
+
+from egs_warp.fem.linear_solver import FactorStatus
+from egs_warp.fem.momentum_projection import MomentumProjection
 
 PANEL = 96
 """Number of columns that are factored at once."""
@@ -12,46 +17,69 @@ CHUNK_BYTES = 2**31
 """Total size of the matrices that are processed at once, bytes; temporary memory is a small multiple of it."""
 
 
-class BatchCholesky:
-    """Cholesky factors L of S = L L^T for several worlds, each stored in a slot.
+class PanelCholesky:
+    """Dense Cholesky solver for the matrices of several worlds, which have one pattern; ``LinearSolver`` with a world
+    axis.
 
     The factorization is left-looking and proceeds by panels: each panel is updated with all columns before it, its
     diagonal block is factored, and the rows below are multiplied by the inverse of that factor. The inverses are
     stored, so that a solve consists of matrix products only. CUDA's own batched factorization is designed for small
-    matrices. Arguments named ``slots`` must be ascending.
+    matrices. Arguments named ``select`` must be ascending. Worlds whose status is not ``DEFINITE`` must not be solved.
     """
 
     def __init__(
-        self, slots: int, size: int, device: torch.device, *, panel: int = PANEL, chunk_bytes: int = CHUNK_BYTES
+        self,
+        upper_pattern: sparse.csc_matrix | sparse.csc_array,
+        worlds: int,
+        device: torch.device,
+        *,
+        panel: int = PANEL,
+        chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
-        """Allocate factors for ``slots`` worlds with (``size``, ``size``) matrices, 8 slots size^2 bytes.
+        """Allocate factors, 8 worlds n^2 bytes.
 
         Args:
-            slots: number of worlds.
-            size: number of rows of each matrix.
+            upper_pattern: (n, n) upper triangle with the diagonal.
+            worlds: number of worlds.
             device: device of the factors.
             panel: number of columns factored at once.
             chunk_bytes: total size of the matrices processed at once.
         """
+        size = len(upper_pattern.indptr) - 1
+        columns = np.repeat(np.arange(size), np.diff(upper_pattern.indptr))
+        self._lower = torch.as_tensor(columns * size + upper_pattern.indices.astype(np.int64), device=device)
         self.size, self.panel = size, panel
         self.chunk = max(1, chunk_bytes // (8 * size * size))
         """Number of worlds whose matrices are processed at once."""
         self._starts = range(0, size, panel)
         kind = {"dtype": torch.float64, "device": device}
-        self._factors = torch.zeros((slots, size, size), **kind)
-        self._inverses = torch.zeros((slots, len(self._starts), panel, panel), **kind)
+        self.status = torch.zeros(worlds, dtype=torch.int8, device=device)
+        """(worlds,) ``FactorStatus`` of each world."""
+        self._factors = torch.zeros((worlds, size, size), **kind)
+        self._inverses = torch.zeros((worlds, len(self._starts), panel, panel), **kind)
 
-    def factor(self, slots: torch.Tensor, matrices: torch.Tensor) -> torch.Tensor:
-        """Factor ``matrices`` into ``slots``.
+    def factor(
+        self,
+        entries: torch.Tensor,
+        diagonal: torch.Tensor,
+        select: torch.Tensor,
+        add_term: Callable[[torch.Tensor], None] | None = None,
+    ) -> None:
+        """Factor the matrices of the worlds ``select``.
 
         Args:
-            slots: (k,) slots to write.
-            matrices: (k, n, n), lower triangles; overwritten.
-
-        Returns:
-            (k,) bool, True where the matrix is positive definite. Other slots must not be used for a solve.
+            entries: (k, nnz) upper entries in the order of the pattern.
+            diagonal: (n,) added to each diagonal.
+            select: (k,) worlds.
+            add_term: function that adds a term to the lower triangles (k, n, n) before they are factored.
         """
-        count = len(slots)
+        count = len(select)
+        matrices = entries.new_zeros(count, self.size * self.size)
+        matrices.index_copy_(1, self._lower, entries)
+        matrices = matrices.view(count, self.size, self.size)
+        matrices.diagonal(dim1=1, dim2=2).add_(diagonal)
+        if add_term is not None:
+            add_term(matrices)
         is_definite = torch.ones(count, dtype=torch.bool, device=matrices.device)
         inverses = self._inverses.new_zeros((count, *self._inverses.shape[1:]))
         for number, start in enumerate(self._starts):
@@ -67,24 +95,27 @@ class BatchCholesky:
             columns[:, : stop - start] = own
             if stop < self.size:
                 columns[:, stop - start :] = columns[:, stop - start :] @ inverse.mT
-        self._factors[slots], self._inverses[slots] = matrices, inverses
-        return is_definite
+        self._factors[select], self._inverses[select] = matrices, inverses
+        self.status[select] = torch.where(is_definite, FactorStatus.DEFINITE, FactorStatus.NONE).to(torch.int8)
 
-    def solve(self, slots: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-        """Return S^-1 ``right`` (k, n, m) with the factors in ``slots`` (k,); ``right`` has the same shape."""
-        is_complete = len(slots) == len(self._factors)
-        # A slice of all slots avoids a copy of the factors.
+    def solve(
+        self, right: torch.Tensor, select: torch.Tensor, projection: MomentumProjection | None = None
+    ) -> torch.Tensor:
+        """Return S^-1 ``right`` (k, n, m) of the worlds ``select`` (k,); apply ``projection`` if given."""
+        is_complete = len(select) == len(self._factors)
+        # A slice of all worlds avoids a copy of the factors.
         parts = [
-            self._solve_chunk(part if is_complete else slots[part], right[part]) for part in self.chunks(len(slots))
+            self._solve_chunk(part if is_complete else select[part], right[part]) for part in self.chunks(len(select))
         ]
-        return parts[0] if len(parts) == 1 else torch.cat(parts)
+        plain = parts[0] if len(parts) == 1 else torch.cat(parts)
+        return plain if projection is None else projection.corrected(right, plain)
 
     def chunks(self, count: int) -> Iterator[slice]:
         """Return slices of ``count`` worlds to be processed at once; a single empty slice if there are none."""
         return (slice(start, min(start + self.chunk, count)) for start in range(0, max(count, 1), self.chunk))
 
-    def _solve_chunk(self, slots: torch.Tensor | slice, right: torch.Tensor) -> torch.Tensor:
-        factors, inverses, solution = self._factors[slots], self._inverses[slots], right.clone()
+    def _solve_chunk(self, select: torch.Tensor | slice, right: torch.Tensor) -> torch.Tensor:
+        factors, inverses, solution = self._factors[select], self._inverses[select], right.clone()
         bounds = [(start, min(start + self.panel, self.size)) for start in self._starts]
         for number, (start, stop) in enumerate(bounds):
             rows = solution[:, start:stop]
