@@ -191,14 +191,14 @@ class _LaunchCache(threading.local):
     """Recorded launches of this thread, which are updated and repeated."""
 
     def __init__(self) -> None:
-        self.launches: dict[tuple[Any, str], tuple[Any, int | tuple[int, int], list[Any]]] = {}
+        self.launches: dict[tuple[Any, str], tuple[Any, int | tuple[int, ...], list[Any]]] = {}
 
 
 _launch_cache = _LaunchCache()
 
 
 def launch_cached(
-    kernel: Any, dim: int | tuple[int, int], *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device
+    kernel: Any, dim: int | tuple[int, ...], *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device
 ) -> None:
     """Launch a kernel at a third of the cost of ``wp.launch``, for kernels that run many times a second.
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from egs_warp.contact.detection import ContactGeometry
-from egs_warp.contact.selection import MAX_CELLS_AT_REST, ContactSelector
+from egs_warp.contact.selection import ACTIVATION_DEPTH, MAX_CELLS_AT_REST, ContactSelector
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.geometry.plane import Plane
 from tests.support.meshes import block_mesh
@@ -64,7 +64,7 @@ def test_forces_follow_their_points_and_deep_points_are_added(geometry: ContactG
     matched = points.transfer_forces(np.array([3, 5, 7]), before, forces)
     assert np.array_equal(matched, [[3, 4, 5], [0, 0, 0], [0, 1, 2]])
     gaps = gaps_of(geometry) - 0.006
-    deep = points.find_deeper(np.array([int(np.argmin(gaps))]), gaps, 0.005)
+    deep = points.find_penetrating(np.array([int(np.argmin(gaps))]), gaps, gaps + 1.0, 0.005 / ACTIVATION_DEPTH)
     assert len(deep) and (gaps[deep] < -0.005).all() and int(np.argmin(gaps)) not in deep
 
 
@@ -98,6 +98,5 @@ def test_rounding_changes_neither_cells_nor_points(geometry: ContactGeometry) ->
     for _ in range(5):
         shaken = gaps + 1e-15 * random.standard_normal(gaps.shape)
         assert np.array_equal(other.select(*none, shaken), chosen)
-        assert np.array_equal(
-            points.find_deeper(chosen, shaken - 0.02, 0.01), points.find_deeper(chosen, gaps - 0.02, 0.01)
-        )
+        deep = [points.find_penetrating(chosen, each - 0.02, each, 0.01 / ACTIVATION_DEPTH) for each in (shaken, gaps)]
+        assert np.array_equal(*deep) and len(deep[0]) > 0

@@ -1,0 +1,156 @@
+"""Kernels for the contacts of all worlds: their record, and the products W^T, W v and W^T f with the contact Jacobian W
+(Eq. 8).
+"""
+
+import warp as wp
+
+from egs_warp.kernels.contact.gaps import embedded_point
+from egs_warp.kernels.contact.height_field import ground_frame, height_and_slopes
+from egs_warp.precision import Mat33, Vec3, Vec4, real
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def contact_record_kernel(
+    # Model:
+    nodes: wp.array[wp.vec4i],
+    weights: wp.array[Vec4],
+    frames: wp.array[Mat33],
+    axes: Mat33,
+    origin: Vec3,
+    spacing: real,
+    coefficients: wp.array2d[real],
+    # In:
+    points: wp.array2d[int],
+    counts: wp.array[int],
+    positions: wp.array2d[Vec3],
+    gaps: wp.array2d[real],
+    faces: wp.array2d[int],
+    # Out:
+    nodes_out: wp.array2d[wp.vec4i],
+    weights_out: wp.array2d[Vec4],
+    axes_out: wp.array2d[Mat33],
+    gaps_out: wp.array2d[real],
+    faces_out: wp.array2d[int],
+):
+    """Write nodes, weights, frame, gap and face of the first ``counts`` of the ``points`` (B, K), and zeros as padding.
+
+    The frame is that of the face in ``frames``, or that of uneven ground below the point if there are ``coefficients``
+    and the face is 0.
+    """
+    world, k = wp.tid()
+    record_nodes = wp.vec4i()
+    record_weights = Vec4()
+    frame = Mat33()
+    gap = real(0.0)
+    face = int(0)
+    if k < counts[world]:
+        point = points[world, k]
+        record_nodes = nodes[point]
+        record_weights = weights[point]
+        gap = gaps[world, point]
+        face = faces[world, point]
+        if face == 0 and coefficients.shape[0] > 0:
+            x = embedded_point(record_nodes, record_weights, positions, world)
+            ground = height_and_slopes(axes, origin, spacing, coefficients, x)
+            frame = ground_frame(axes, ground[1], ground[2])
+        else:
+            frame = frames[face]
+    nodes_out[world, k] = record_nodes
+    weights_out[world, k] = record_weights
+    axes_out[world, k] = frame
+    gaps_out[world, k] = gap
+    faces_out[world, k] = face
+
+
+@wp.kernel
+def transfer_forces_kernel(
+    # In:
+    points: wp.array2d[int],
+    counts: wp.array[int],
+    previous: wp.array2d[int],
+    previous_counts: wp.array[int],
+    forces: wp.array2d[Vec3],
+    # Out:
+    forces_out: wp.array2d[Vec3],
+):
+    """Map ``forces`` (B, L) at the ``previous`` (B, L) points to ``points`` (B, K); they are zero for new points and
+    padding.
+    """
+    world, k = wp.tid()
+    force = Vec3()
+    if k < counts[world]:
+        for j in range(previous_counts[world]):
+            if previous[world, j] == points[world, k]:
+                force = forces[world, j]
+    forces_out[world, k] = force
+
+
+@wp.kernel
+def contact_jacobian_kernel(
+    # In:
+    counts: wp.array[int],
+    nodes: wp.array2d[wp.vec4i],
+    weights: wp.array2d[Vec4],
+    axes: wp.array2d[Mat33],
+    # Out:
+    rows_out: wp.array3d[real],
+):
+    """Write the transposed contact Jacobian W^T (c, 3N, 3K) into zeroed memory: the nodal impulses of a unit impulse
+    along each contact axis.
+    """
+    world, k = wp.tid()
+    if k < counts[world]:
+        for corner in range(4):
+            node = nodes[world, k][corner]
+            for axis in range(3):
+                for i in range(3):
+                    rows_out[world, 3 * node + i, 3 * k + axis] = weights[world, k][corner] * axes[world, k][axis, i]
+
+
+@wp.kernel
+def contact_velocities_kernel(
+    # In:
+    counts: wp.array[int],
+    nodes: wp.array2d[wp.vec4i],
+    weights: wp.array2d[Vec4],
+    axes: wp.array2d[Mat33],
+    velocities: wp.array3d[real],
+    # Out:
+    speeds_out: wp.array3d[real],
+):
+    """Compute the contact velocities W v (c, 3K, m) for nodal velocities v (c, 3N, m). The velocities of padding are
+    set to zero."""
+    world, k, column = wp.tid()
+    at_point = Vec3()
+    if k < counts[world]:
+        for corner in range(4):
+            n = 3 * nodes[world, k][corner]
+            weight = weights[world, k][corner]
+            for i in range(3):
+                at_point[i] += weight * velocities[world, n + i, column]
+    speeds = axes[world, k] * at_point
+    for axis in range(3):
+        speeds_out[world, 3 * k + axis, column] = speeds[axis]
+
+
+@wp.kernel
+def nodal_forces_kernel(
+    # In:
+    counts: wp.array[int],
+    nodes: wp.array2d[wp.vec4i],
+    weights: wp.array2d[Vec4],
+    axes: wp.array2d[Mat33],
+    forces: wp.array2d[Vec3],
+    # Out:
+    pushes_out: wp.array2d[Vec3],
+):
+    """Compute the nodal forces W^T f (c, N) in newtons. Each node sums over the contacts in their order."""
+    world, node = wp.tid()
+    total = Vec3()
+    for k in range(counts[world]):
+        for corner in range(4):
+            if nodes[world, k][corner] == node:
+                total += weights[world, k][corner] * (wp.transpose(axes[world, k]) * forces[world, k])
+    pushes_out[world, node] = total
