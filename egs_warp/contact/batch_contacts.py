@@ -5,6 +5,7 @@ The mathematics is in the kernels that ``ContactDetector`` and ``ContactSelector
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -44,7 +45,7 @@ class BatchContacts(BatchedRecord):
         points: torch.Tensor,
         counts: torch.Tensor,
         positions: torch.Tensor,
-        start: tuple[torch.Tensor, torch.Tensor],
+        start: Sequence[torch.Tensor],
     ) -> BatchContacts:
         """Build the contacts of the selected points, and block until the device has finished.
 
@@ -60,14 +61,10 @@ class BatchContacts(BatchedRecord):
         nodes, faces = counts.new_empty((*points.shape, 4)), torch.empty_like(points)
         weights, axes, gaps = (positions.new_empty((*points.shape, *size)) for size in ((4,), (3, 3), ()))
         if points.numel() > 0:
-            gaps_there, faces_there = (each.contiguous() for each in start)
-            detector.enqueue_record(
-                [*_integers(points, counts), _vectors(positions), as_warp(gaps_there, real), *_integers(faces_there)],
-                [
-                    *(as_warp(nodes, wp.vec4i), as_warp(weights, Vec4), as_warp(axes, Mat33), as_warp(gaps, real)),
-                    as_warp(faces, wp.int32),
-                ],
-            )
+            kinds = (nodes, wp.vec4i), (weights, Vec4), (axes, Mat33), (gaps, real), (faces, wp.int32)
+            inputs = _arrays(wp.int32, points, counts) + _arrays(Vec3, positions)
+            inputs += _arrays(real, start[0]) + _arrays(wp.int32, start[1])
+            detector.enqueue_record(inputs, [as_warp(*each) for each in kinds])
         return cls(points, counts, nodes, weights, axes, gaps, faces)
 
     @property
@@ -115,17 +112,9 @@ class BatchContacts(BatchedRecord):
         """Return (c, K, 3) newtons, the contact ``forces`` (c, L, 3) at the first ``counts`` (c,) of the ``points`` (c,
         L) of the previous step; zero for new points.
         """
-        out = forces.new_zeros((*self.points.shape, 3))
-        if out.numel() > 0 and forces.numel() > 0:
-            previous = [*_integers(points, counts), _vectors(forces)]
-            launch_on(
-                out.device,
-                kernels.transfer_forces_kernel,
-                tuple(self.points.shape),
-                inputs=[*_integers(self.points, self.counts), *previous],
-                outputs=[(out, Vec3)],
-            )
-        return out
+        has_force = torch.arange(points.shape[1], device=points.device) < counts[:, None]
+        is_same = (self.points[:, :, None] == points[:, None]) & self.valid[:, :, None] & has_force[:, None]
+        return is_same.double() @ forces
 
     def with_capacity(self, capacity: int) -> BatchContacts:
         """Return the contacts padded to ``capacity``, which is at least the current one."""
@@ -144,61 +133,44 @@ def point_gaps(detector: ContactDetector, positions: torch.Tensor) -> tuple[torc
     gaps = positions.new_empty((len(positions), detector.point_count))
     faces = torch.empty_like(gaps, dtype=torch.int32)
     if len(positions) > 0:
-        detector.enqueue_gaps(_vectors(positions), as_warp(gaps, real), as_warp(faces, wp.int32))
+        detector.enqueue_gaps(*_arrays(Vec3, positions), *_arrays(real, gaps), *_arrays(wp.int32, faces))
     return gaps, faces
 
 
 def select_contacts(
-    selector: ContactSelector,
-    previous: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
-    gaps: torch.Tensor,
+    selector: ContactSelector, previous: Sequence[torch.Tensor], gaps: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Select the points of the next step, as ``ContactSelector.select`` does.
 
     Args:
         selector: selector of the body's points.
-        previous: points (c, L) of the previous step, their counts (c,), and (c, L) bool, True for those that carried
-            load.
+        previous: points (c, L) int32 of the previous step, their counts (c,) int32, and (c, L) int32, 1 for those that
+            carried load.
         gaps: (c, P) m, at the predicted end of the step.
 
     Returns:
-        (c, K) int32 points, and (c,) int32 counts.
+        (c, L + C) int32 points, and (c,) int32 counts.
     """
-    points, counts, loaded = previous
-    cells, slots = selector.cell_count, points.shape[1]
-    lowest, candidates, selected = (counts.new_zeros((len(gaps), n)) for n in (cells, slots + cells, slots + cells))
-    new_counts = torch.zeros_like(counts)
+    cells, slots = selector.cell_count, previous[0].shape[1]
+    lowest, candidates, points = (previous[1].new_zeros((len(gaps), n)) for n in (cells, slots + cells, slots + cells))
+    counts = torch.zeros_like(previous[1])
     if len(gaps) > 0:
-        selector.enqueue_selection(
-            _integers(points, counts, loaded.int()),
-            as_warp(gaps, real),
-            _integers(lowest, candidates),
-            _integers(selected, new_counts),
-        )
-    return selected, new_counts
+        arrays = (_arrays(wp.int32, *each) for each in (previous, (lowest, candidates), (points, counts)))
+        before, work, selected = arrays
+        selector.enqueue_selection(before, *_arrays(real, gaps), work, selected)
+    return points, counts
 
 
 def penetrating_points(
-    selector: ContactSelector, contacts: BatchContacts, gaps: torch.Tensor, start_gaps: torch.Tensor, tolerance: float
+    selector: ContactSelector, contacts: BatchContacts, gaps: Sequence[torch.Tensor], tolerance: float
 ) -> torch.Tensor:
-    """Return (c, C) int32, the deepest point of each cell that would end too deep and is not in ``contacts``, or -1, as
-    ``ContactSelector.find_penetrating`` does.
-
-    Args:
-        selector: selector of the body's points.
-        contacts: contacts of the step.
-        gaps: (c, P) m, at the end of the step.
-        start_gaps: (c, P) m.
-        tolerance: penetration tolerance, m.
+    """Return (c, C) int32, the deepest point of each cell that would end too deep and is not in ``contacts``, or -1;
+    ``gaps`` (c, P) m at the end and at the start of the step, penetration ``tolerance`` m.
     """
-    found, lowest = gaps.new_zeros(len(gaps)), contacts.counts.new_empty((len(gaps), selector.cell_count))
-    if len(gaps) > 0:
-        selector.enqueue_penetrating(
-            _integers(contacts.points, contacts.counts),
-            [as_warp(each.contiguous(), real) for each in (gaps, start_gaps)],
-            tolerance,
-            [as_warp(found, real), as_warp(lowest, wp.int32)],
-        )
+    found, lowest = gaps[0].new_zeros(len(contacts.counts)), contacts.counts[:, None].repeat(1, selector.cell_count)
+    if len(found) > 0:
+        inputs = _arrays(wp.int32, contacts.points, contacts.counts), _arrays(real, *gaps)
+        selector.enqueue_penetrating(*inputs, tolerance, [*_arrays(real, found), *_arrays(wp.int32, lowest)])
     return lowest
 
 
@@ -206,18 +178,13 @@ def append_points(
     selector: ContactSelector, contacts: BatchContacts, lowest: torch.Tensor, gaps: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Append the points in ``lowest`` (c, C) that are not negative, those with the smallest ``gaps`` (c, P) in metres
-    first; return the points (c, K) and their counts (c,).
+    first; return the points (c, K) and their counts (c,). There is at least one world.
     """
     points, counts = padded(contacts.points, selector.cell_count), contacts.counts.clone()
-    if len(points) > 0:
-        lowest = as_warp(lowest.contiguous(), wp.int32)
-        selector.enqueue_append(lowest, as_warp(gaps.contiguous(), real), _integers(points, counts))
+    selector.enqueue_append(*_arrays(wp.int32, lowest), *_arrays(real, gaps), _arrays(wp.int32, points, counts))
     return points, counts
 
 
-def _integers(*tensors: torch.Tensor) -> list[wp.array]:
-    return [as_warp(each.contiguous(), wp.int32) for each in tensors]
-
-
-def _vectors(positions: torch.Tensor) -> wp.array:
-    return as_warp(positions.contiguous(), Vec3)
+def _arrays(kind: Any, *tensors: torch.Tensor) -> list[wp.array]:
+    """Return Warp arrays that share the memory of the ``tensors``, or of copies of those that are not contiguous."""
+    return [as_warp(each.contiguous(), kind) for each in tensors]

@@ -187,9 +187,9 @@ class BatchSolver:
             more = nonzero((added >= 0).any(dim=1) & (done.converged | done.contacts_added))
             if len(more) == 0:
                 break
-            start = [each[todo[more]] for each in (problem.positions, *start_gaps)]
+            positions, *gaps_there = (each[todo[more]] for each in (problem.positions, *start_gaps))
             points, counts = append_points(self.points, active_contacts.gather(more), added[more], ends[more])
-            grown = BatchContacts.at(self.detector, points, counts, start[0], (start[1], start[2]))
+            grown = BatchContacts.at(self.detector, points, counts, positions, gaps_there)
             grown = grown.with_capacity(max(grown.capacity, contacts.capacity))
             extra = grown.capacity - contacts.capacity
             forces = padded(done.forces[more], extra)
@@ -208,7 +208,7 @@ class BatchSolver:
         """
         gaps, _ = point_gaps(self.detector, task.problem.end_positions(velocities))
         tolerance = self.penetration_tolerance
-        return penetrating_points(self.points, task.contacts, gaps, task.start_gaps, tolerance), gaps
+        return penetrating_points(self.points, task.contacts, (gaps, task.start_gaps), tolerance), gaps
 
     def _round(
         self,

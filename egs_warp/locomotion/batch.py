@@ -324,7 +324,7 @@ class BatchStepper:
         """Return the contacts, their forces (c, K, 3) N in the previous step, and gaps and faces at the start."""
         ballistic = state.velocities + problem.dt * self.common.gravity
         gaps, _ = point_gaps(self.detector, problem.end_positions(ballistic))
-        previous = state.points, state.counts, state.forces[:, :, 0] > 0.0
+        previous = state.points, state.counts, (state.forces[:, :, 0] > 0.0).int()
         chosen = select_contacts(self.selector, previous, gaps)
         start_gaps = point_gaps(self.detector, state.positions)
         contacts = BatchContacts.at(self.detector, *chosen, state.positions, start_gaps)

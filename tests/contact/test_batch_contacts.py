@@ -77,7 +77,7 @@ def test_selection_equals_that_of_one_world_in_every_step(
         counts = torch.tensor([len(each) for each in before], dtype=torch.int32)
         for world, (its, load) in enumerate(zip(before, loads, strict=True)):
             previous[world, : len(its)], loaded[world, : len(its)] = torch.from_numpy(its), torch.from_numpy(load > 0.0)
-        chosen = select_contacts(points, (previous, counts, loaded), gaps)
+        chosen = select_contacts(points, (previous, counts, loaded.int()), gaps)
         contacts = BatchContacts.at(detector, *chosen, torch.from_numpy(places), start)
         for world, place in enumerate(places):
             expected = points.select(before[world], loads[world] > 0.0, detector.gaps(place)[0])
@@ -85,7 +85,7 @@ def test_selection_equals_that_of_one_world_in_every_step(
         # Without noise, all points of a cell would be equally deep.
         noisy = gaps + 0.01 * torch.from_numpy(random.normal(size=gaps.shape))
         tolerance = 0.005 / ACTIVATION_DEPTH
-        lowest = penetrating_points(points, contacts, noisy, gaps, tolerance)
+        lowest = penetrating_points(points, contacts, (noisy, gaps), tolerance)
         more = append_points(points, contacts, lowest, noisy)
         joined = BatchContacts.at(detector, *more, torch.from_numpy(places), start)
         for world in range(WORLDS):

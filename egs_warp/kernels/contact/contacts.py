@@ -65,29 +65,6 @@ def contact_record_kernel(
 
 
 @wp.kernel
-def transfer_forces_kernel(
-    # In:
-    points: wp.array2d[int],
-    counts: wp.array[int],
-    previous: wp.array2d[int],
-    previous_counts: wp.array[int],
-    forces: wp.array2d[Vec3],
-    # Out:
-    forces_out: wp.array2d[Vec3],
-):
-    """Map ``forces`` (B, L) at the ``previous`` (B, L) points to ``points`` (B, K); they are zero for new points and
-    padding.
-    """
-    world, k = wp.tid()
-    force = Vec3()
-    if k < counts[world]:
-        for j in range(previous_counts[world]):
-            if previous[world, j] == points[world, k]:
-                force = forces[world, j]
-    forces_out[world, k] = force
-
-
-@wp.kernel
 def contact_jacobian_kernel(
     # In:
     counts: wp.array[int],

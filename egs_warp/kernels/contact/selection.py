@@ -138,17 +138,8 @@ def select_points_kernel(
 ):
     """Select the points of a step by the rules of ``ContactSelector``, in ascending order.
 
-    Args:
-        cell_from_point: (P,).
-        activation_distance: m.
-        hysteresis: m.
-        previous: (B, L) points of the previous step, of which the first ``previous_counts`` are valid.
-        loaded: (B, L) 1 for points that carried load, else 0.
-        gaps: (B, P) m, at the predicted end of the step.
-        lowest: (B, C) lowest active point of each cell, -1 if there is none.
-        candidates: (B, L + C) workspace.
-        points_out: (B, K), K at least L + C.
-        counts_out: (B,).
+    ``previous`` and ``loaded`` are (B, L), ``gaps`` (B, P) at the predicted end, ``lowest`` (B, C) the lowest active
+    point of each cell; ``candidates`` (B, L + C) is a workspace.
     """
     world, lane = wp.tid()
     slots = previous.shape[1]

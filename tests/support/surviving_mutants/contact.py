@@ -54,19 +54,13 @@ CONTACT = [
         "the bound only avoids a division by zero, but no tetrahedron has all its points at their mean",
     ),
     Survivor(
-        "contact/batch_contacts.py",
-        "points.scatter_(1, torch.where(selected, columns, capacity), torch.where(selected, numbers, 0))",
-        "points.scatter_(1, torch.where(selected, columns, capacity), torch.where(selected, numbers, 1))",
-        "points that are not selected go to an extra column, which is cut off",
-    ),
-    Survivor(
         "contact/batch_step.py",
         "limit = ((1.0 - 1e-4 * length) * maximum[waiting]).clamp(min=self.tolerance)",
         "limit = ((1.0 - 1e-4 % length) * maximum[waiting]).clamp(min=self.tolerance)",
         "the same for full steps; a half step may be worse by a ten-thousandth than the rule allows",
     ),
     Survivor(
-        "contact/batch_contacts.py",
+        "contact/device_coulomb.py",
         "matrices = start.new_empty((worlds, size, (size + 4) // 4, 4))",
         "matrices = start.new_empty((worlds, size, (size + 4) // 3, 4))",
         "capacity for a few more numbers",
@@ -100,12 +94,6 @@ CONTACT = [
         "column = wp.clamp(wp.floor(u + real(0.5)), real(-2.0), real(columns) + real(2.0))",
         "column = wp.clamp(wp.floor(u + real(0.5)), real(- 1.0), real(columns) + real(2.0))",
         "far outside, the edge value extends without limit, so the clamp changes nothing",
-    ),
-    Survivor(
-        "contact/batch_step.py",
-        "sinking = torch.where(gaps < task.start_gaps - allowed, gaps, 0.0)",
-        "sinking = torch.where(gaps < task.start_gaps - allowed, gaps, 1.0)",
-        "a point that does not sink is added neither with gap 0 nor with 1 m: only deep ones are",
     ),
     Survivor(
         "contact/batch_step.py",
