@@ -133,7 +133,7 @@ def point_gaps(detector: ContactDetector, positions: torch.Tensor) -> tuple[torc
     gaps = positions.new_empty((len(positions), detector.point_count))
     faces = torch.empty_like(gaps, dtype=torch.int32)
     if len(positions) > 0:
-        detector.enqueue_gaps(*_arrays(Vec3, positions), *_arrays(real, gaps), *_arrays(wp.int32, faces))
+        detector.enqueue_gaps(as_warp(positions.contiguous(), Vec3), as_warp(gaps, real), as_warp(faces, wp.int32))
     return gaps, faces
 
 
@@ -157,7 +157,7 @@ def select_contacts(
     if len(gaps) > 0:
         arrays = (_arrays(wp.int32, *each) for each in (previous, (lowest, candidates), (points, counts)))
         before, work, selected = arrays
-        selector.enqueue_selection(before, *_arrays(real, gaps), work, selected)
+        selector.enqueue_selection(before, as_warp(gaps, real), work, selected)
     return points, counts
 
 
@@ -181,7 +181,8 @@ def append_points(
     first; return the points (c, K) and their counts (c,). There is at least one world.
     """
     points, counts = padded(contacts.points, selector.cell_count), contacts.counts.clone()
-    selector.enqueue_append(*_arrays(wp.int32, lowest), *_arrays(real, gaps), _arrays(wp.int32, points, counts))
+    selected = _arrays(wp.int32, points, counts)
+    selector.enqueue_append(as_warp(lowest.contiguous(), wp.int32), as_warp(gaps.contiguous(), real), selected)
     return points, counts
 
 

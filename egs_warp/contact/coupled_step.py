@@ -122,7 +122,7 @@ class CoupledSolver:
         if check is not None and not check.is_penetrating:
             return None
         if check is not None and check.deepest is not None:
-            return contacts.joined(check.deepest)
+            return contacts.concatenate(check.deepest)
         gaps, _ = self.detector.gaps(problem.end_positions(end.velocities))
         if gaps.min() >= -ACTIVATION_DEPTH * self.penetration_tolerance:
             return None
@@ -130,7 +130,7 @@ class CoupledSolver:
         added = self.points.find_penetrating(contacts.points, gaps, start_gaps, self.penetration_tolerance)
         if len(added) == 0:
             return None
-        return contacts.joined(self.detector.contact_set(added, start))
+        return contacts.concatenate(self.detector.contact_set(added, start))
 
     def _round(
         self,

@@ -129,11 +129,11 @@ class ContactSet:
         """Dense (3n, 3N) contact Jacobian W."""
         return self.jacobian.toarray()
 
-    def joined(self, others: ContactSet) -> ContactSet:
+    def concatenate(self, others: ContactSet) -> ContactSet:
         """Return these contacts followed by ``others`` of the same body."""
         names = "points", "nodes", "weights", "axes", "gaps", "faces"
         pairs = [(getattr(self, name), getattr(others, name)) for name in names]
-        return ContactSet(*map(np.concatenate, pairs), self.node_count)
+        return ContactSet(*map(np.concatenate, pairs), node_count=self.node_count)
 
     @property
     def nearest_nodes(self) -> np.ndarray:
@@ -407,7 +407,7 @@ class ContactDetector:
         if self.geometry.field is not None:
             copy_into(self._positions, positions[None])
         self.enqueue_record([record.points, record.counts, self._positions, found.gaps, found.faces], record.arrays)
-        return ContactSet(points, *record.read(count), len(positions))
+        return ContactSet(points, *record.read(count), node_count=len(positions))
 
 
 class _PointGaps:
@@ -416,15 +416,16 @@ class _PointGaps:
     def __init__(self, count: int, device: wp.Device, *, has_one_face: bool) -> None:
         self.gaps, self.faces = zeros((1, count), real, device), zeros((1, count), int, device)
         self._mirrors = [PinnedMirror(self.gaps), PinnedMirror(self.faces)][: 1 if has_one_face else 2]
-        self.on_host = np.zeros(count), np.zeros(count, np.int32)
-        self.on_host[1].flags.writeable = False
+        faces = np.zeros(count, np.int32)
+        faces.flags.writeable = False
+        self.on_host: tuple[np.ndarray, np.ndarray] = np.zeros(count), faces
 
     def download(self) -> None:
         """Copy the result to new arrays on the host; with one face, its index is always 0."""
         values = [values[0] for values in PinnedMirror.get_all(*self._mirrors)]
         for each in values:
             each.flags.writeable = False
-        self.on_host = values[0], *(values[1:] or self.on_host[1:])
+        self.on_host = values[0], values[-1] if len(values) == 2 else self.on_host[1]
 
 
 class _RecordBuffers:

@@ -212,7 +212,7 @@ class _ContactRecords:
         """Return the downloaded contacts."""
         axes, weights, gaps, nodes, faces, points, count = self._on_host
         arrays = [each[: int(count[0])].copy() for each in (nodes, weights, axes, gaps, faces)]
-        return ContactSet(points[: int(count[0])].astype(int), *arrays, node_count)
+        return ContactSet(points[: int(count[0])].astype(int), *arrays, node_count=node_count)
 
 
 def _split(packed: torch.Tensor, width: int) -> list[torch.Tensor]:

@@ -18,12 +18,6 @@ CONTACT = [
         "39 bisections end an arm within 2e-12 of its length from the ground, 40 within 1e-12",
     ),
     Survivor(
-        "contact/selection.py",
-        "lowest = self._lowest(gaps < self.activation_distance, gaps)",
-        "lowest = self._lowest(gaps <= self.activation_distance, gaps)",
-        "a gap exactly at the threshold may count either way",
-    ),
-    Survivor(
         "kernels/contact/coulomb.py",
         "sweeps = _FEW_SWEEPS",
         "sweeps = - _FEW_SWEEPS",
