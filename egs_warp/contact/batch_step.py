@@ -12,18 +12,18 @@ from typing import Protocol
 import torch
 import warp as wp
 
-from egs_warp.contact.batch_contacts import BatchContacts, BatchDetector, coulomb_forces_batch, padded
+from egs_warp.contact.batch_contacts import BatchContacts, append_points, padded, penetrating_points, point_gaps
 from egs_warp.contact.coupled_step import (
-    ACTIVATION_DEPTH,
     ACTIVATION_RESIDUAL,
     COULOMB_TOLERANCE,
     MAX_ACTIVATION_ROUNDS,
-    MAX_CREEP,
-    MAX_SINK,
     PUSH_OUT_FRACTION,
 )
+from egs_warp.contact.detection import ContactDetector
+from egs_warp.contact.device_coulomb import coulomb_forces_batch
 from egs_warp.contact.newton import DELASSUS_REGULARIZATION
 from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
+from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batch_problem import BatchMomentumProjection, BatchProblem, apply_inverse
 from egs_warp.fem.batched import BatchedRecord, launch_on, nonzero
 from egs_warp.kernels.contact import newton_convergence as rule
@@ -76,7 +76,8 @@ class BatchResult(BatchedRecord):
 class BatchSolver:
     """``CoupledSolver`` for many worlds."""
 
-    detector: BatchDetector
+    detector: ContactDetector
+    points: ContactSelector
     push_out_cap: float
     """Maximum push-out speed, m/s."""
     penetration_tolerance: float
@@ -183,12 +184,15 @@ class BatchSolver:
                 break
             with self.stages("detect"):
                 added, ends = self._points_to_add(task, done.velocities)
-            more = nonzero(added.any(dim=1) & (done.converged | done.contacts_added))
+            more = nonzero((added >= 0).any(dim=1) & (done.converged | done.contacts_added))
             if len(more) == 0:
                 break
-            new = self.detector.contacts(added[more], *(each[todo[more]] for each in start_gaps), order=ends[more])
-            grown, forces = self.detector.append_contacts(active_contacts.gather(more), done.forces[more], new)
+            positions, *gaps_there = (each[todo[more]] for each in (problem.positions, *start_gaps))
+            points, counts = append_points(self.points, active_contacts.gather(more), added[more], ends[more])
+            grown = BatchContacts.at(self.detector, points, counts, positions, gaps_there)
+            grown = grown.with_capacity(max(grown.capacity, contacts.capacity))
             extra = grown.capacity - contacts.capacity
+            forces = padded(done.forces[more], extra)
             # Copy, since the caller's contacts must not change.
             contacts = contacts.with_capacity(grown.capacity).gather(all_worlds)
             result = replace(result, forces=padded(result.forces, extra))
@@ -199,14 +203,12 @@ class BatchSolver:
         return contacts, result
 
     def _points_to_add(self, task: _RoundInputs, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (c, P) bool, the points that would be too deep at the end of the step with ``velocities`` (c, N, 3),
-        and (c, P) m, all gaps at the end.
+        """Return (c, C), the points of each cell that would be too deep at the end of the step with ``velocities`` (c,
+        N, 3), or -1, and (c, P) m, all gaps at the end.
         """
-        gaps, _ = self.detector.gaps(task.problem.end_positions(velocities))
+        gaps, _ = point_gaps(self.detector, task.problem.end_positions(velocities))
         tolerance = self.penetration_tolerance
-        allowed = torch.where(gaps < -tolerance, MAX_CREEP * tolerance, MAX_SINK * tolerance)
-        sinking = torch.where(gaps < task.start_gaps - allowed, gaps, 0.0)
-        return self.detector.find_deeper(task.contacts, sinking, ACTIVATION_DEPTH * tolerance), gaps
+        return penetrating_points(self.points, task.contacts, (gaps, task.start_gaps), tolerance), gaps
 
     def _round(
         self,
@@ -268,7 +270,7 @@ class BatchSolver:
         """
         with self.stages("detect"):
             added, _ = self._points_to_add(task, search.velocities[rows])
-        joined = added.any(dim=1)
+        joined = (added >= 0).any(dim=1)
         search.contacts_added[rows], search.active[rows] = joined, ~joined
 
     def _newton_step(self, task: _RoundInputs, search: _NewtonState, response: BatchLinearization) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from egs_warp.contact.detection import ContactDetector, ContactSet, push_out_speeds
 from egs_warp.contact.newton import ContactLinearization, NewtonIterate, PenetrationCheck
 from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
-from egs_warp.contact.selection import ContactSelector
+from egs_warp.contact.selection import ACTIVATION_DEPTH, ContactSelector
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.kernels.contact.newton_convergence import ACCEPTED, ENDED, FAILED, NEAR_END, NEEDS_TANGENT, SHORTEN
 from egs_warp.muscles.tension import MuscleEnergy
@@ -24,19 +24,10 @@ MAX_ACTIVATION_ROUNDS = 6
 """Maximum number of rounds of a step. Points may be added to the contact set after each round except the last."""
 PUSH_OUT_FRACTION = 0.2
 """Fraction of the depth beyond the tolerance that a step pushes a point out."""
-ACTIVATION_DEPTH = 0.6
-"""Depth beyond which a point is added to the contact set if it would end there, as a fraction of the penetration
-tolerance.
-"""
 ACTIVATION_RESIDUAL = 1e-3
 """Residual divided by dt x weight. When a round first falls below it, the end of the step is accurate enough to add the
 points that would be too deep there. They are also added at the end of the round.
 """
-MAX_SINK = 0.3
-"""Fraction of the penetration tolerance by which a point that is already deep may sink in a step without being added.
-"""
-MAX_CREEP = 0.02
-"""``MAX_SINK`` for a point that would end deeper than the penetration tolerance itself."""
 COULOMB_TOLERANCE = 1e-6
 """Violation of Coulomb's law at the end of a step, as a fraction of dt g, the speed that free fall gains in a step."""
 
@@ -131,24 +122,15 @@ class CoupledSolver:
         if check is not None and not check.is_penetrating:
             return None
         if check is not None and check.deepest is not None:
-            deepest = check.deepest[self.points.order_by_gap(check.deepest[:, 0], check.deepest[:, 1])]
-            return self.detector.contact_set_at(
-                np.concatenate([contacts.points, deepest[:, 0].astype(int)]),
-                start,
-                np.concatenate([contacts.gaps, deepest[:, 2]]),
-                np.concatenate([contacts.faces, deepest[:, 3].astype(np.int32)]),
-            )
+            return contacts.concatenate(check.deepest)
         gaps, _ = self.detector.gaps(problem.end_positions(end.velocities))
-        depth = ACTIVATION_DEPTH * self.penetration_tolerance
-        if gaps.min() >= -depth:
+        if gaps.min() >= -ACTIVATION_DEPTH * self.penetration_tolerance:
             return None
         start_gaps, _ = self.detector.gaps(start)
-        # A point that is already deep is added only if it would sink further.
-        allowed = np.where(gaps < -self.penetration_tolerance, MAX_CREEP, MAX_SINK) * self.penetration_tolerance
-        added = self.points.find_deeper(contacts.points, np.where(gaps < start_gaps - allowed, gaps, 0.0), depth)
+        added = self.points.find_penetrating(contacts.points, gaps, start_gaps, self.penetration_tolerance)
         if len(added) == 0:
             return None
-        return self.detector.contact_set(np.concatenate([contacts.points, added]), start)
+        return contacts.concatenate(self.detector.contact_set(added, start))
 
     def _round(
         self,

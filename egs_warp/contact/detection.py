@@ -2,12 +2,14 @@
 Jacobian (Eq. 8-10).
 
 ``contact_geometry`` builds the points once for a body. ``ContactDetector`` evaluates their gaps with the kernels in
-``kernels/contact/gaps.py`` and ``kernels/contact/height_field.py``, and builds the ``ContactSet`` of a step.
+``kernels/contact/gaps.py`` and ``kernels/contact/height_field.py``, and builds the ``ContactSet`` of a step with
+``contact_record_kernel``.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -27,8 +29,9 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.geometry.unique_rows import distinct_rows
 from egs_warp.kernels.contact import gaps as kernels
+from egs_warp.kernels.contact.contacts import contact_record_kernel
 from egs_warp.kernels.contact.height_field import ground_gaps_kernel
-from egs_warp.launching import PinnedMirror, launch_cached
+from egs_warp.launching import PinnedMirror, copy_into, grow_capacity, launch_cached, zeros
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 MIN_OUTSIDE_FRACTION = 0.1
@@ -125,6 +128,12 @@ class ContactSet:
     def dense_jacobian(self) -> np.ndarray:
         """Dense (3n, 3N) contact Jacobian W."""
         return self.jacobian.toarray()
+
+    def concatenate(self, others: ContactSet) -> ContactSet:
+        """Return these contacts followed by ``others`` of the same body."""
+        names = "points", "nodes", "weights", "axes", "gaps", "faces"
+        pairs = [(getattr(self, name), getattr(others, name)) for name in names]
+        return ContactSet(*map(np.concatenate, pairs), node_count=self.node_count)
 
     @property
     def nearest_nodes(self) -> np.ndarray:
@@ -289,38 +298,37 @@ def _bulge(places: np.ndarray) -> np.ndarray:
 
 
 class ContactDetector:
-    """Evaluates the gaps of all points and builds contact sets."""
+    """Evaluates the gaps of all points and builds contacts, in one world or in many."""
 
     def __init__(self, geometry: ContactGeometry, *, device: str | None = None) -> None:
         self.geometry = geometry
         self.device = wp.get_device(device)
-        self._tet_from_point = wp.array(geometry.tet_from_point, dtype=int, device=device)
-        self._weights = wp.array(geometry.weights, dtype=Vec4, device=device)
-        self._tets = wp.array(geometry.mesh.tets, dtype=wp.vec4i, device=device)
+        self.point_count = len(geometry.tet_from_point)
+        corners = geometry.mesh.tets[geometry.tet_from_point]
         # Uneven ground replaces the first plane.
         flat = slice(0 if geometry.field is None else 1, None)
         rows = np.array([[*plane.normal, plane.offset] for plane in geometry.planes])[flat]
-        self._planes = wp.array(rows.reshape(-1, 4), dtype=Vec4, device=device)
-        self._solids = wp.array(geometry.solid_of_each_plane[flat], dtype=int, device=device)
-        self._field: list[Any] = []
+        frames = np.array([[plane.normal, *plane.tangents()] for plane in geometry.planes]).reshape(-1, 3, 3)
+        self._points = [
+            wp.array(corners, dtype=wp.vec4i, device=device),
+            wp.array(geometry.weights, dtype=Vec4, device=device),
+        ]
+        self._planes = [
+            wp.array(rows.reshape(-1, 4), dtype=Vec4, device=device),
+            wp.array(geometry.solid_of_each_plane[flat], dtype=int, device=device),
+        ]
+        self._frames = wp.array(frames, dtype=Mat33, device=device)
+        axes, origin, spacing, coefficients = np.eye(3), np.zeros(3), 1.0, np.zeros((0, 0))
         if geometry.field is not None:
-            coefficients = wp.array(geometry.field.coefficients, dtype=real, device=device)
-            axes, origin = Mat33(*geometry.field.axes.ravel().tolist()), Vec3(*geometry.field.origin.tolist())
-            self._field = [axes, origin, real(geometry.field.spacing), coefficients]
-        self._corners = wp.array(geometry.mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device)
+            field = geometry.field
+            axes, origin, spacing, coefficients = field.axes, field.origin, field.spacing, field.coefficients
+        self._field: list[Any] = [Mat33(*axes.ravel().tolist()), Vec3(*origin.tolist()), real(spacing)]
+        self._field.append(wp.array(coefficients, dtype=real, ndim=2, device=device))
         self._heights = wp.zeros(len(rows) * len(geometry.mesh.nodes), dtype=real, device=device)
-        self._positions = wp.zeros(len(geometry.mesh.nodes), dtype=Vec3, device=device)
-        self._host_positions = PinnedMirror(self._positions)
-        count = len(geometry.tet_from_point)
-        self._gaps = wp.zeros(count, dtype=real, device=device)
-        self._nearest = wp.zeros(count, dtype=int, device=device)
-        self._host_gaps, self._host_nearest = PinnedMirror(self._gaps), PinnedMirror(self._nearest)
-        self._frames = np.array([[plane.normal, *plane.tangents()] for plane in geometry.planes]).reshape(-1, 3, 3)
-        self._only_face: np.ndarray | None = None
-        if len(geometry.planes) == 1:
-            self._only_face = np.zeros(count, np.int32)
-            self._only_face.flags.writeable = False
-        self._cached_gaps: OrderedDict[bytes, tuple[np.ndarray, np.ndarray]] = OrderedDict()
+        self._positions = wp.zeros((1, len(geometry.mesh.nodes)), dtype=Vec3, device=device)
+        self._cached_gaps: OrderedDict[bytes, _PointGaps] = OrderedDict()
+        self._last_gaps: _PointGaps | None = None
+        self._record: _RecordBuffers | None = None
 
     def gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Evaluate the gaps of all points; the result is cached and read-only.
@@ -336,46 +344,32 @@ class ContactDetector:
         """
         key = positions.tobytes()
         if key not in self._cached_gaps:
-            self._cached_gaps[key] = self._compute_gaps(positions)
-            while len(self._cached_gaps) > _CACHED_CONFIGURATIONS:
-                self._cached_gaps.popitem(last=False)
-        return self._cached_gaps[key]
+            if len(self._cached_gaps) < _CACHED_CONFIGURATIONS:
+                has_one_face = len(self.geometry.planes) == 1
+                found = _PointGaps(self.point_count, self.device, has_one_face=has_one_face)
+            else:
+                _, found = self._cached_gaps.popitem(last=False)
+            copy_into(self._positions, positions[None])
+            self.enqueue_gaps(self._positions, found.gaps, found.faces)
+            found.download()
+            self._cached_gaps[key] = found
+        self._last_gaps = self._cached_gaps[key]
+        return self._last_gaps.on_host
 
-    def _compute_gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        self._host_positions.put(positions)
-        self.enqueue_gaps(self._positions, self._gaps, self._nearest)
-        nearest = self._only_face
-        if nearest is None:
-            gaps, nearest = PinnedMirror.get_all(self._host_gaps, self._host_nearest)
-            nearest.flags.writeable = False
-        else:
-            gaps = self._host_gaps.get()
-        gaps.flags.writeable = False
-        return gaps, nearest
-
-    def enqueue_gaps(self, positions: wp.array, gaps: wp.array, nearest: wp.array) -> None:
-        """Evaluate the gaps of ``positions`` (N,) on the device into ``gaps`` (P,) and ``nearest`` (P,),
-        asynchronously.
+    def enqueue_gaps(self, positions: wp.array, gaps: wp.array, faces: wp.array) -> None:
+        """Evaluate the gaps at ``positions`` (B, N) on the device into ``gaps`` (B, P) and ``faces`` (B, P),
+        asynchronously. All arrays are contiguous.
         """
-        solids, outputs = [self._planes, self._solids, positions], [gaps, nearest]
+        inputs, outputs = [*self._points, *self._planes, positions], [gaps, faces]
         if self.device.is_cpu:
-            inputs = [self._corners, self._weights, *solids]
-            launch_cached(
-                kernels.all_gaps_kernel, 1, inputs=inputs, outputs=[self._heights, *outputs], device=self.device
-            )
-        else:
-            inputs = [self._tets, self._tet_from_point, self._weights, *solids]
-            launch_cached(
-                kernels.point_gaps_kernel, len(self._gaps), inputs=inputs, outputs=outputs, device=self.device
-            )
-        if self._field:
-            wp.launch(
-                ground_gaps_kernel,
-                dim=len(self.geometry.tet_from_point),
-                inputs=[self._tets, self._tet_from_point, self._weights, *self._field, positions],
-                outputs=outputs,
-                device=self.device,
-            )
+            outputs.insert(0, self._heights)
+        kernel, dim = (
+            (kernels.all_gaps_kernel, len(gaps)) if self.device.is_cpu else (kernels.point_gaps_kernel, gaps.shape)
+        )
+        launch_cached(kernel, dim, inputs=inputs, outputs=outputs, device=self.device)
+        if self.geometry.field is not None:
+            inputs = [*self._points, *self._field, positions]
+            launch_cached(ground_gaps_kernel, gaps.shape, inputs=inputs, outputs=[gaps, faces], device=self.device)
 
     def points_within(self, positions: np.ndarray, distance: float) -> np.ndarray:
         """Return the positions (k, 3) of the contact points closer than ``distance`` metres to an obstacle at
@@ -385,25 +379,77 @@ class ContactDetector:
         nodes = self.geometry.mesh.tets[self.geometry.tet_from_point[near]]
         return np.einsum("kw,kwi->ki", self.geometry.weights[near], positions[nodes])
 
+    def enqueue_record(self, inputs: Sequence[wp.array], outputs: Sequence[wp.array]) -> None:
+        """Write the record of contacts on the device, asynchronously.
+
+        Args:
+            inputs: ``points`` (B, K) and ``counts`` (B,); at the start of the step, ``positions`` (B, N), and ``gaps``
+                and ``faces`` of all points (B, P).
+            outputs: ``nodes``, ``weights``, ``axes``, ``gaps`` and ``faces`` (B, K), as in ``ContactSet``.
+        """
+        launch_cached(
+            contact_record_kernel,
+            inputs[0].shape,
+            inputs=[*self._points, self._frames, *self._field, *inputs],
+            outputs=outputs,
+            device=self.device,
+        )
+
     def contact_set(self, points: np.ndarray, positions: np.ndarray) -> ContactSet:
         """Return the contact set of ``points`` (n,); ``positions`` (N, 3) at the start of the step."""
-        gaps, nearest = self.gaps(positions)
-        return self.contact_set_at(points, positions, gaps[points], nearest[points])
-
-    def contact_set_at(
-        self, points: np.ndarray, positions: np.ndarray, gaps: np.ndarray, faces: np.ndarray
-    ) -> ContactSet:
-        """Return the contact set of ``points`` (n,) whose ``gaps`` (n,) in metres and ``faces`` (n,) are known;
-        ``positions`` (N, 3) at the start of the step.
-        """
-        nodes = self.geometry.mesh.tets[self.geometry.tet_from_point[points]]
-        weights = self.geometry.weights[points]
-        axes = self._frames[faces]
+        self.gaps(positions)
+        found, count = self._last_gaps, len(points)
+        assert found is not None
+        if self._record is None or self._record.capacity < count:
+            self._record = _RecordBuffers(grow_capacity(count), self.device)
+        record = self._record
+        record.write(points)
         if self.geometry.field is not None:
-            uneven = faces == 0
-            places = np.einsum("nw,nwi->ni", weights[uneven], positions[nodes[uneven]])
-            axes[uneven] = self.geometry.field.frames(places)
-        return ContactSet(points, nodes, weights, axes, gaps, faces, len(positions))
+            copy_into(self._positions, positions[None])
+        self.enqueue_record([record.points, record.counts, self._positions, found.gaps, found.faces], record.arrays)
+        return ContactSet(points, *record.read(count), node_count=len(positions))
+
+
+class _PointGaps:
+    """Gaps of all points of one world at some positions, on the device and, read-only, on the host."""
+
+    def __init__(self, count: int, device: wp.Device, *, has_one_face: bool) -> None:
+        self.gaps, self.faces = zeros((1, count), real, device), zeros((1, count), int, device)
+        self._mirrors = [PinnedMirror(self.gaps), PinnedMirror(self.faces)][: 1 if has_one_face else 2]
+        faces = np.zeros(count, np.int32)
+        faces.flags.writeable = False
+        self.on_host: tuple[np.ndarray, np.ndarray] = np.zeros(count), faces
+
+    def download(self) -> None:
+        """Copy the result to new arrays on the host; with one face, its index is always 0."""
+        values = [values[0] for values in PinnedMirror.get_all(*self._mirrors)]
+        for each in values:
+            each.flags.writeable = False
+        self.on_host = values[0], values[-1] if len(values) == 2 else self.on_host[1]
+
+
+class _RecordBuffers:
+    """Record of up to ``capacity`` contacts of one world."""
+
+    def __init__(self, capacity: int, device: wp.Device) -> None:
+        self.capacity = capacity
+        kinds = int, wp.vec4i, Vec4, Mat33, real, int
+        self.points, *self.arrays = [zeros((1, capacity), kind, device) for kind in kinds]
+        self.counts = zeros(1, int, device)
+        self._host_points, self._host_counts, *self._host_arrays = (
+            PinnedMirror(each) for each in (self.points, self.counts, *self.arrays)
+        )
+        self._padded = np.zeros((1, capacity), np.int32)
+
+    def write(self, points: np.ndarray) -> None:
+        """Upload ``points`` (n,)."""
+        self._padded[0, : len(points)] = points
+        self._host_points.put(self._padded)
+        self._host_counts.put(np.array([len(points)]))
+
+    def read(self, count: int) -> list[np.ndarray]:
+        """Return copies of the arrays after ``points`` of the first ``count`` contacts."""
+        return [values[0, :count] for values in PinnedMirror.get_all(*self._host_arrays)]
 
 
 def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float, slop: float) -> np.ndarray:

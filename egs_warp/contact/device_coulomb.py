@@ -1,7 +1,8 @@
-"""Asynchronous Coulomb solve of a step's contacts on a GPU; ``coulomb_forces`` is the version on the host.
+"""Coulomb solves on a GPU: of one step's contacts, asynchronously, and of many worlds. ``coulomb_forces`` is the
+version on the host.
 
-There is no continuation: a solve that fails is repeated on the host (``DeviceNewtonIterate.newton_steps``). The kernel
-is in ``kernels/contact/coulomb.py``.
+The asynchronous solve has no continuation: if it fails, it is repeated on the host
+(``DeviceNewtonIterate.newton_steps``). The kernel is in ``kernels/contact/coulomb.py``.
 """
 
 from __future__ import annotations
@@ -10,9 +11,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.contact.coulomb import MAX_ITERATIONS, TOLERANCE
+from egs_warp.contact.coulomb import FAILURE_TOLERANCE, MAX_ITERATIONS, REGULARIZATION_STEPS, TOLERANCE
 from egs_warp.contact.newton import DELASSUS_REGULARIZATION
-from egs_warp.fem.batched import launch_on
+from egs_warp.fem.batched import launch_on, nonzero
 from egs_warp.fem.cuda_graphs import GraphStream, PinnedUpload
 from egs_warp.kernels.contact import coulomb as kernels
 from egs_warp.precision import Vec4, real
@@ -83,3 +84,76 @@ class CoulombWorkspace:
             outputs=[(violation, real)],
             block_dim=lanes,
         )
+
+
+def coulomb_forces_batch(
+    counts: torch.Tensor,
+    delassus: torch.Tensor,
+    free_velocity: torch.Tensor,
+    shift: torch.Tensor,
+    frictions: torch.Tensor,
+    start: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Compute Coulomb forces of c worlds, as ``coulomb_forces`` does in one.
+
+    Args:
+        counts: (c,) int32, number of contacts of each world.
+        delassus: (c, 3K, 3K) m/(N s).
+        free_velocity: (c, 3K) m/s without contact forces.
+        shift: (c, K) m/s, bias of the normal velocities.
+        frictions: (c,).
+        start: (c, K, 3) newtons, initial forces.
+
+    Returns:
+        (c, K, 3) newtons and the residuals (c,) in m/s.
+    """
+    worlds, capacity, _ = start.shape
+    if worlds == 0 or capacity == 0:
+        return start.clone(), start.new_zeros(worlds)
+    result, residual = _solve(counts, delassus, free_velocity, shift, frictions, start)
+    failed = nonzero(residual > FAILURE_TOLERANCE)
+    if len(failed) == 0:
+        return result, residual
+    counts, operators, free, shift, frictions, forces = (
+        each[failed].contiguous() for each in (counts, delassus, free_velocity, shift, frictions, start)
+    )
+    diagonal = operators.diagonal(dim1=1, dim2=2)
+    mean = diagonal.sum(dim=1, keepdim=True) / (3 * counts[:, None])
+    for softness in (*REGULARIZATION_STEPS, 0.0):
+        soft = operators + torch.diag_embed((softness * mean).expand_as(diagonal))
+        forces, new_residual = _solve(counts, soft, free, shift, frictions, forces)
+    better = new_residual < residual[failed]
+    result[failed[better]], residual[failed[better]] = forces[better], new_residual[better]
+    return result, residual
+
+
+def _solve(
+    counts: torch.Tensor,
+    delassus: torch.Tensor,
+    free_velocity: torch.Tensor,
+    shift: torch.Tensor,
+    frictions: torch.Tensor,
+    start: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Compute the forces with the kernel alone, without continuation."""
+    worlds, capacity, _ = start.shape
+    forces, residual, size = start.clone(), start.new_zeros(worlds), 3 * capacity
+    vectors = start.new_empty((worlds, 5, size))
+    indices = torch.empty((worlds, 2, size), dtype=torch.int32, device=start.device)
+    matrices = start.new_empty((worlds, size, (size + 4) // 4, 4))
+    lanes = kernels.BLOCK if start.is_cuda else 1
+    values = delassus, free_velocity, shift, frictions
+    launch_on(
+        start.device,
+        kernels.coulomb_kernel,
+        (worlds, lanes),
+        inputs=[
+            (counts, wp.int32),
+            *((each.contiguous(), real) for each in values),
+            *(TOLERANCE, MAX_ITERATIONS),
+            *((forces.view(worlds, size), real), (vectors, real), (indices, wp.int32), (matrices, Vec4)),
+        ],
+        outputs=[(residual, real)],
+        block_dim=lanes,
+    )
+    return forces, residual

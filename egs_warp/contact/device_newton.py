@@ -15,10 +15,10 @@ import numpy as np
 
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.device_newton_workspace import FROM_BASE, FROM_TRIAL, NewtonWorkspace, TrialReadback
-from egs_warp.contact.device_selection import DeviceContactSelector
 from egs_warp.contact.device_step import SolveEnd, StepWorkspace
 from egs_warp.contact.newton import ContactLinearization, NewtonStepResult, PenetrationCheck
 from egs_warp.contact.newton_convergence import NewtonProgress
+from egs_warp.contact.prefetch import ContactPrefetch
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.step_problem import Tangent
@@ -37,10 +37,8 @@ class DeviceContactLinearizer(StepWorkspace):
     linearisation, ``current``, can be used.
     """
 
-    def __init__(
-        self, factors: TiledCholesky, body: SoftBody, muscles: MuscleSet, selector: DeviceContactSelector
-    ) -> None:
-        super().__init__(factors, body, muscles, selector)
+    def __init__(self, factors: TiledCholesky, body: SoftBody, muscles: MuscleSet, prefetch: ContactPrefetch) -> None:
+        super().__init__(factors, body, muscles, prefetch)
         self._workspaces: dict[int, NewtonWorkspace] = {}
         self.current: DeviceContactLinearization | None = None
 
@@ -325,9 +323,11 @@ class DeviceNewtonIterate:
         forces, violation = readback.forces[: 3 * count].reshape(-1, 3).copy(), float(readback.coulomb_violation[0])
         end = response.parse_iterate(self.tension, forces, readback)
         if end._penetration is not None and end._penetration.is_penetrating:
-            end._penetration = replace(end._penetration, deepest=owner.selector.deepest(workspace.capacity))
+            end._penetration = replace(end._penetration, deepest=owner.prefetch.deepest(workspace.capacity))
         workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = first, end, None
-        owner.last_solve = SolveEnd(end.velocities, problem.dt, response.contacts.points, workspace.capacity)
+        owner.last_solve = SolveEnd(
+            *(end.velocities, problem.dt, response.contacts.points, end.forces[:, 0] > 0.0, workspace.capacity)
+        )
         if progress.has(REPEAT):
             forces, violation = response.solve_coulomb(first.free_contact_velocities, shift, friction, first.forces)
             end = first.line_search_point(forces)

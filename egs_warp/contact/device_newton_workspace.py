@@ -28,7 +28,7 @@ from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.kernels.contact import batch_contacts as batch_kernels
+from egs_warp.kernels.contact import contacts as contact_kernels
 from egs_warp.kernels.contact import iterate as kernels
 from egs_warp.kernels.contact import newton_convergence as convergence_kernels
 from egs_warp.muscles.tension import MuscleEnergy
@@ -144,7 +144,7 @@ class NewtonWorkspace:
 
     def _enqueue_contact_velocities(self, velocities: torch.Tensor, out: torch.Tensor) -> None:
         self._launch(
-            batch_kernels.contact_velocities_kernel,
+            contact_kernels.contact_velocities_kernel,
             (1, self.capacity, velocities.shape[1]),
             [*self._batch_contacts, as_warp(velocities[None], real)],
             [as_warp(out[None], real)],
@@ -209,7 +209,7 @@ class NewtonWorkspace:
         torch.mul(owner.rotation_modes, owner.masses.repeat_interleave(3)[:, None], out=momenta)
         impulses.zero_()
         self._launch(
-            batch_kernels.contact_jacobian_kernel,
+            contact_kernels.contact_jacobian_kernel,
             (1, self.capacity),
             self._batch_contacts,
             [as_warp(impulses[None], real)],
@@ -341,18 +341,19 @@ class NewtonWorkspace:
         for target, value in zip(self._previous_iterate, (velocities, forces), strict=True):
             target.copy_(value)
         self._download_rest()
-        self.owner.enqueue_prefetch(self.end_positions, self.velocities, dt, self._points)
+        before = self._points, self.coulomb.counts, self._solved_forces[::3]
+        self.owner.enqueue_prefetch(self.end_positions, self.velocities, dt, *before)
         self._start_download()
 
     def _enqueue_penetration(self) -> None:
         """Count the points that penetrate too far at the end of the last trial."""
-        self.owner.selector.enqueue_penetration(
+        self.owner.prefetch.enqueue_penetration(
             vectors(self.end_positions), self._points, self.coulomb.counts, self._penetrating_count
         )
 
     def _download_rest(self) -> None:
         """Add the minimum gap and the internal torque to the penetration test."""
-        self.owner.selector.enqueue_min_gap(self._min_gap[0])
+        self.owner.prefetch.enqueue_min_gap(self._min_gap[0])
         self._internal_torque.copy_(self._torque)
 
     def enqueue_newton(self, dt: float, ratio: float) -> None:

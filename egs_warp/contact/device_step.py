@@ -14,7 +14,7 @@ import torch
 import warp as wp
 
 from egs_warp.contact.detection import ContactSet
-from egs_warp.contact.device_selection import DeviceContactSelector
+from egs_warp.contact.prefetch import ContactPrefetch
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
@@ -42,14 +42,16 @@ class SolveEnd:
     dt: float
     points: np.ndarray
     """(n,) contact points of the solve; ``capacity`` is the contact capacity K of its workspace."""
+    loaded: np.ndarray
+    """(n,) bool, True for points that carry load."""
     capacity: int
 
-    def capacity_if_continued(self, state: BodyState, dt: float, points: np.ndarray) -> int | None:
-        """Return the capacity if a step of ``dt`` seconds from ``state``, with the previous contact points ``points``,
-        continues from this end; None otherwise.
+    def capacity_if_continued(self, state: BodyState, dt: float, points: np.ndarray, loaded: np.ndarray) -> int | None:
+        """Return the capacity if a step of ``dt`` seconds from ``state``, with the previous contact points ``points``
+        of which those ``loaded`` (n,) carry load, continues from this end; None otherwise.
         """
         same = self.velocities is state.velocities and self.points is points and self.dt == dt
-        return self.capacity if same else None
+        return self.capacity if same and np.array_equal(self.loaded, loaded) else None
 
 
 class StepWorkspace:
@@ -57,10 +59,8 @@ class StepWorkspace:
     momentum projection.
     """
 
-    def __init__(
-        self, factors: TiledCholesky, body: SoftBody, muscles: MuscleSet, selector: DeviceContactSelector
-    ) -> None:
-        self.factors, self.body, self.stream, self.selector = factors, body, factors.stream, selector
+    def __init__(self, factors: TiledCholesky, body: SoftBody, muscles: MuscleSet, prefetch: ContactPrefetch) -> None:
+        self.factors, self.body, self.stream, self.prefetch = factors, body, factors.stream, prefetch
         elements = body.assembly.elements
         assert isinstance(elements, WarpElasticity)
         self.elements = elements
@@ -83,16 +83,18 @@ class StepWorkspace:
         self._directions_upload = PinnedUpload(self.stream, 4 * (3 * self.segment_count + 2 * _CAPACITY_STEP))
         self._loaded_step: tuple[BodyState, float] | None = None
         """State and step size in seconds of the loaded step."""
-        self._prefetch_points: np.ndarray | None = None
-        """(m,) contact points of the previous step for which a prefetch is in flight."""
+        self._prefetch_points: tuple[np.ndarray, np.ndarray] | None = None
+        """(m,) contact points of the previous step for which a prefetch is in flight, and (m,) bool, which of them
+        carried load.
+        """
         self.last_solve: SolveEnd | None = None
         """End of the last solve. The contacts of a step that continues from it are already prefetched."""
         self._prefetch_capacity: int | None = None
-        """Contact capacity of the solve that prefetched the contacts; None if ``start_prefetch`` did."""
+        """Contact capacity of the solve that prefetched the contacts; None if ``ContactPrefetch.start`` did."""
         self.predicted_start: Any = None
         """Start of the step for which a plan is in flight; None after any other work."""
         self.gaps_of: StepProblem | None = None
-        """Step whose gaps at the start the selector holds."""
+        """Step whose gaps at the start ``prefetch`` holds."""
 
     def zeros(self, *shape: int) -> torch.Tensor:
         """Return a float64 tensor of zeros on the device."""
@@ -135,21 +137,21 @@ class StepWorkspace:
         self.elements.enqueue_start(vectors(self.positions), self.gradients)
         self._enqueue_ballistic(self.positions, self.velocities, dt, self.ballistic)
 
-    def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray) -> None:
+    def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray, loaded: np.ndarray) -> None:
         """Start ``select_contacts`` for a step of ``dt`` seconds from ``state``, asynchronously; ``before`` (m,) are
-        the contact points of the step that ends there.
+        the contact points of the step that ends there, and ``loaded`` (m,) is True for those that carry load.
         """
         with self.stream:
             self._cancel_prefetch()
             self._load(state, dt)
             self._prefetch_capacity = (
-                self.last_solve.capacity_if_continued(state, dt, before) if self.last_solve else None
+                self.last_solve.capacity_if_continued(state, dt, before, loaded) if self.last_solve else None
             )
             if self._prefetch_capacity is None:
-                self.selector.start_prefetch(*self._ends, before)
+                self.prefetch.start(*self._ends, before, loaded)
             else:
-                self.selector.advance_prefetch()
-        self._prefetch_points, self.last_solve = before, None
+                self.prefetch.advance()
+        self._prefetch_points, self.last_solve = (before, loaded), None
 
     def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet:
         """Select the contacts of the step ``problem``.
@@ -161,10 +163,12 @@ class StepWorkspace:
         """
         with self.stream:
             self.set_problem(problem)
-        if self._prefetch_points is None or not np.array_equal(self._prefetch_points, before):
-            self.prefetch_contacts(problem.state, problem.dt, before)
+        if self._prefetch_points is None or not all(map(np.array_equal, self._prefetch_points, (before, loaded))):
+            self.prefetch_contacts(problem.state, problem.dt, before, loaded)
         self.gaps_of, self._prefetch_points = problem, None
-        return self.selector.select(before, loaded, problem.state.positions, capacity=self._prefetch_capacity)
+        if self._prefetch_capacity is None:
+            self.stream.wait()
+        return self.prefetch.contacts(len(before) if self._prefetch_capacity is None else self._prefetch_capacity)
 
     def _cancel_prefetch(self) -> None:
         """Drop a prefetch whose result was not used. Its upload may still be in flight, so this blocks."""
@@ -172,12 +176,12 @@ class StepWorkspace:
             self._prefetch_points = None
             self.stream.wait()
 
-    def enqueue_prefetch(self, ends: torch.Tensor, velocities: torch.Tensor, dt: float, points: torch.Tensor) -> None:
-        """Queue the selection for a step from ``ends`` (3N,) at ``velocities`` (3N,), given its previous contact points
-        ``points`` (K,) int32.
+    def enqueue_prefetch(self, ends: torch.Tensor, velocities: torch.Tensor, dt: float, *before: torch.Tensor) -> None:
+        """Queue the selection for a step from ``ends`` (3N,) at ``velocities`` (3N,), given the contact points
+        ``before`` it: (K,) int32, their number (1,) int32 and their normal forces (K,) newtons.
         """
         self._enqueue_ballistic(ends, velocities, dt, self._next_ballistic)
-        self.selector.enqueue_prefetch(vectors(self._next_ballistic), points)
+        self.prefetch.enqueue_next((self._ends[0], vectors(ends)), vectors(self._next_ballistic), *before)
 
     def _enqueue_ballistic(
         self, positions: torch.Tensor, velocities: torch.Tensor, dt: float, ballistic: torch.Tensor

@@ -110,9 +110,9 @@ class ContactLinearizer(Protocol):
         """
         ...
 
-    def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray) -> None:
+    def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray, loaded: np.ndarray) -> None:
         """Start ``select_contacts`` for the probable next step, of ``dt`` seconds from ``state``; ``before`` (m,) are
-        the contact points of the step that ends there.
+        the contact points of the step that ends there, and ``loaded`` (m,) is True for those that carry load.
         """
         ...
 
@@ -150,7 +150,7 @@ class HostContactLinearizer:
         """Return None; the caller selects contacts on the host."""
         return None
 
-    def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray) -> None:
+    def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray, loaded: np.ndarray) -> None:
         """Do nothing; there is no device to work in parallel."""
 
     def predict_velocities(
@@ -181,10 +181,8 @@ class PenetrationCheck:
     """Minimum gap of all points, m."""
     internal_torque: np.ndarray
     """(3,) N m, torque of the internal gradient about the centre of mass at the end."""
-    deepest: np.ndarray | None = None
-    """(k, 4) deepest penetrating point of each cell: its index, its gap at the end in metres, and its gap and face
-    at the start of the step. None if it was not downloaded.
-    """
+    deepest: ContactSet | None = None
+    """Deepest penetrating point of each cell, the deepest first; None if it was not downloaded."""
 
     @classmethod
     def of(cls, readback: np.ndarray) -> PenetrationCheck:

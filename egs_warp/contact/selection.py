@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+import warp as wp
 from scipy.spatial import KDTree
 
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.geometry.tetmesh import mean_edge_length
+from egs_warp.kernels.contact import selection as kernels
+from egs_warp.launching import PinnedMirror, copy_into, grow_capacity, launch_cached, zeros
+from egs_warp.precision import real
 
 MAX_CELLS_AT_REST = 32
 """Maximum number of cells that touch the ground at rest. The cage cannot resolve more forces than it has nodes
@@ -19,20 +26,35 @@ GAP_TOLERANCE_FRACTION = 1e-7
 to the centre of the cell is selected. A flat sole is flat only to rounding, and rounding would select different
 points on different machines.
 """
+ACTIVATION_DEPTH = 0.6
+"""Depth beyond which a point is added to the contact set if it would end there, as a fraction of the penetration
+tolerance.
+"""
+MAX_SINK = 0.3
+"""Fraction of the penetration tolerance by which a point that is already deep may sink in a step without being added.
+"""
+MAX_CREEP = 0.02
+"""``MAX_SINK`` for a point that would end deeper than the penetration tolerance itself."""
 _SPACING_GROWTH = 1.1
 """Growth factor of the cell spacing until few enough cells touch the ground."""
 
 
 class ContactSelector:
-    """Selector of contact points: cells of the surface, at least 0.4 mean cage edges apart, with at most one point
-    each.
+    """Selector of contact points, in one world or in many: cells of the surface, at least 0.4 mean cage edges apart,
+    with at most one point each.
 
     A cell contributes its lowest point. A selected point is dropped once its gap exceeds twice the activation distance.
     A point without load is also dropped if its cell has a clearly lower point. Without this hysteresis points would
     alternate, and the load would oscillate.
+
+    Points that would end a step too deep are added in the step: those deeper than ``ACTIVATION_DEPTH`` of the
+    penetration tolerance that have sunk by more than ``MAX_SINK`` of it (``MAX_CREEP`` if they are deeper than the
+    tolerance), again only the lowest of each cell.
     """
 
-    def __init__(self, geometry: ContactGeometry, *, activation_distance: float, hysteresis: float) -> None:
+    def __init__(
+        self, geometry: ContactGeometry, *, activation_distance: float, hysteresis: float, device: str | None = None
+    ) -> None:
         """Divide the surface into cells.
 
         Args:
@@ -40,6 +62,7 @@ class ContactSelector:
             activation_distance: m. A cell is active if its lowest point may come this close to a solid in the
                 step.
             hysteresis: m. Another point of the cell replaces an unloaded one only if it is lower by this much.
+            device: device of the selection.
         """
         self.geometry, self.activation_distance, self.hysteresis, self.gap_tolerance = (
             geometry,
@@ -55,12 +78,84 @@ class ContactSelector:
         sole = np.flatnonzero(heights < heights.min() + 2.0 * activation_distance)
         spacing = _MIN_SPACING * mean_edge_length(geometry.mesh)
         self.cell_from_point, away = _few_cells(positions, heights, sole, spacing, MAX_CELLS_AT_REST)
-        self.order = np.lexsort((np.rint(away / self.gap_tolerance), self.cell_from_point))
-        """(P,) point indices sorted by cell, those closest to the cell centre first."""
+        # Sorted by cell, those closest to the cell centre first.
+        order = np.lexsort((np.rint(away / self.gap_tolerance), self.cell_from_point))
         self.cell_count = int(self.cell_from_point.max()) + 1
+        bounds = np.searchsorted(self.cell_from_point[order], np.arange(self.cell_count + 1))
+        self.device = wp.get_device(device)
+        self._order, self._bounds, self._cell_from_point = (
+            wp.array(each, dtype=int, device=device) for each in (order, bounds, self.cell_from_point)
+        )
+        self._lanes = 1 if self.device.is_cpu else kernels.BLOCK
+        self._buffers: _SelectionBuffers | None = None
+
+    def enqueue_lowest(self, gaps: wp.array, near: float, lowest: wp.array) -> None:
+        """Find the lowest point of each cell with a gap below ``near`` metres, -1 if there is none, asynchronously.
+
+        Args:
+            gaps: (B, P) m.
+            near: m.
+            lowest: (B, C) int, overwritten.
+        """
+        inputs = [self._order, self._bounds, near, self.gap_tolerance, gaps]
+        self._launch(kernels.lowest_point_per_cell_kernel, (*lowest.shape, self._lanes), inputs, [lowest])
+
+    def enqueue_selection(
+        self, previous: Sequence[wp.array], gaps: wp.array, work: Sequence[wp.array], selected: Sequence[wp.array]
+    ) -> None:
+        """Select the points of the next step, in ascending order, asynchronously.
+
+        Args:
+            previous: points (B, L) of the previous step, their counts (B,), and (B, L) int, 1 for those that carried
+                load.
+            gaps: (B, P) m, at the predicted end of the step.
+            work: workspaces (B, C) int and (B, L + C) int.
+            selected: points (B, K) with K at least L + C, and counts (B,), overwritten.
+        """
+        lowest, candidates = work
+        self.enqueue_lowest(gaps, self.activation_distance, lowest)
+        inputs = [self._cell_from_point, self.activation_distance, self.hysteresis, *previous, gaps, lowest]
+        self._launch(kernels.select_points_kernel, (len(lowest), self._lanes), inputs, [candidates, *selected])
+
+    def enqueue_penetrating(
+        self,
+        contacts: Sequence[wp.array],
+        gaps: Sequence[wp.array],
+        tolerance: float,
+        penetrating: Sequence[wp.array],
+    ) -> None:
+        """Find the points that would end a step too deep and are no contacts, asynchronously.
+
+        Args:
+            contacts: points (B, K) and counts (B,).
+            gaps: (B, P) m, at the end and at the start of the step.
+            tolerance: penetration tolerance, m.
+            penetrating: (B,), increased by the number of such points, and (B, C) int, overwritten with the deepest of
+                each cell, -1 if there is none.
+        """
+        inputs = [self._order, self._bounds, self.gap_tolerance, ACTIVATION_DEPTH * tolerance, tolerance]
+        inputs += [MAX_SINK, MAX_CREEP, *contacts, *gaps]
+        self._launch(kernels.penetrating_points_kernel, (*penetrating[1].shape, self._lanes), inputs, penetrating)
+
+    def enqueue_append(self, lowest: wp.array, gaps: wp.array, contacts: Sequence[wp.array]) -> None:
+        """Append points to contacts, those with the smallest gaps first, asynchronously.
+
+        Args:
+            lowest: (B, C) int, points that are no contacts, or -1.
+            gaps: (B, P) m, by which they are sorted.
+            contacts: points (B, K) and counts (B,), extended; K must suffice.
+        """
+        inputs = [self.gap_tolerance, lowest, gaps]
+        self._launch(kernels.append_points_kernel, (len(lowest), self._lanes), inputs, contacts)
+
+    def _launch(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: Sequence[wp.array]) -> None:
+        if self.device.is_cpu:
+            launch_cached(kernel, dim, inputs=inputs, outputs=outputs, device=self.device)
+        else:
+            wp.launch(kernel, dim, inputs=inputs, outputs=list(outputs), device=self.device, block_dim=self._lanes)
 
     def select(self, previous: np.ndarray, loaded: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """Select the points of the next step.
+        """Select the points of the next step in one world.
 
         Args:
             previous: (m,) points of the previous step.
@@ -70,59 +165,38 @@ class ContactSelector:
         Returns:
             (n,) points in ascending order.
         """
-        lowest = self._lowest(gaps < self.activation_distance, gaps)
-        return self.select_from(previous, loaded, gaps[previous], lowest, gaps[lowest])
+        buffers = self._buffers_for(len(previous))
+        buffers.write(previous, loaded)
+        copy_into(buffers.gaps, gaps[None])
+        self.enqueue_selection(buffers.previous, buffers.gaps, buffers.work, buffers.selected)
+        return buffers.read()
 
-    def select_from(
-        self, previous: np.ndarray, loaded: np.ndarray, gaps: np.ndarray, lowest: np.ndarray, lowest_gaps: np.ndarray
+    def find_penetrating(
+        self, points: np.ndarray, gaps: np.ndarray, start_gaps: np.ndarray, tolerance: float
     ) -> np.ndarray:
-        """Select the points of the next step from the lowest point of each cell.
+        """Return (k,), the deepest point of each cell that would end too deep and is not in ``points`` (n,), the
+        deepest first.
 
         Args:
-            previous: (m,) points of the previous step.
-            loaded: (m,) bool, True for points that carried load.
-            gaps: (m,) m, of ``previous`` at the predicted end.
-            lowest: (k,) lowest point of each active cell.
-            lowest_gaps: (k,) m.
-
-        Returns:
-            (n,) points in ascending order.
+            points: (n,) contact points of the step.
+            gaps: (P,) m, at the end of the step.
+            start_gaps: (P,) m.
+            tolerance: penetration tolerance, m.
         """
-        cells = self.cell_from_point
-        close = gaps < 2.0 * self.activation_distance
-        low = np.full(self.cell_count, np.inf)
-        low[cells[lowest]] = lowest_gaps
-        retained = previous[close & (loaded | (gaps <= low[cells[previous]] + self.hysteresis))]
-        added = lowest[~np.isin(cells[lowest], cells[retained])]
-        return np.sort(np.concatenate([retained, added]))
+        buffers = self._buffers_for(len(points))
+        buffers.write(points, np.zeros(len(points), bool))
+        copy_into(buffers.gaps, gaps[None])
+        copy_into(buffers.start_gaps, start_gaps[None])
+        buffers.selected[1].zero_()
+        both, lowest = [buffers.gaps, buffers.start_gaps], buffers.work[0]
+        self.enqueue_penetrating(buffers.previous[:2], both, tolerance, [buffers.penetrating, lowest])
+        self.enqueue_append(lowest, buffers.gaps, buffers.selected)
+        return buffers.read()
 
-    def find_deeper(self, points: np.ndarray, gaps: np.ndarray, depth: float) -> np.ndarray:
-        """Return (k,), the deepest point of each cell that ends more than ``depth`` metres deep and is not in
-        ``points`` (n,).
-        """
-        deep = gaps < -depth
-        deep[points] = False
-        return self._lowest(deep, gaps)
-
-    def order_by_gap(self, points: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """Return (n,), the order in which ``find_deeper`` lists ``points`` (n,) with ``gaps`` (n,) m, each the lowest
-        of its cell.
-        """
-        return np.lexsort((points, np.rint(gaps / self.gap_tolerance)))
-
-    def _lowest(self, among: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """Return (k,), the lowest point of each cell in the mask ``among`` (P,), lowest first. Ties go to the point
-        closest to the centre.
-        """
-        if not among.any():
-            return self.order[:0]
-        points = self.order[among[self.order]]
-        cells, heights = self.cell_from_point[points], np.rint(gaps[points] / self.gap_tolerance)
-        starts = np.flatnonzero(np.diff(cells, prepend=-1))
-        lowest_heights = np.repeat(np.minimum.reduceat(heights, starts), np.diff(starts, append=len(points)))
-        lowest = np.flatnonzero(heights == lowest_heights)
-        lowest = points[lowest[np.diff(cells[lowest], prepend=-1) > 0]]
-        return lowest[self.order_by_gap(lowest, gaps[lowest])]
+    def _buffers_for(self, count: int) -> _SelectionBuffers:
+        if self._buffers is None or self._buffers.capacity < count:
+            self._buffers = _SelectionBuffers(self, grow_capacity(count))
+        return self._buffers
 
     @staticmethod
     def transfer_forces(points: np.ndarray, before: np.ndarray, forces: np.ndarray) -> np.ndarray:
@@ -131,6 +205,38 @@ class ContactSelector:
         now, then = np.nonzero(points[:, None] == before)
         matched[now] = forces[then]
         return matched
+
+
+class _SelectionBuffers:
+    """Buffers of the selection in one world, with up to ``capacity`` points of the previous step."""
+
+    def __init__(self, selector: ContactSelector, capacity: int) -> None:
+        device, cells, count = selector.device, selector.cell_count, len(selector.cell_from_point)
+        self.capacity = capacity
+        self.gaps, self.start_gaps = (zeros((1, count), real, device) for _ in range(2))
+        self.penetrating = zeros(1, real, device)
+        points, loaded = (zeros((1, capacity), int, device) for _ in range(2))
+        self.previous = [points, zeros(1, int, device), loaded]
+        self.work = [zeros((1, cells), int, device), zeros((1, capacity + cells), int, device)]
+        self.selected = [zeros((1, capacity + cells), int, device), zeros(1, int, device)]
+        self._inputs, self._results = (
+            [PinnedMirror(each) for each in arrays] for arrays in (self.previous, self.selected)
+        )
+        self._padded = np.zeros((2, 1, capacity), np.int32)
+
+    def write(self, points: np.ndarray, loaded: np.ndarray) -> None:
+        """Upload ``points`` (m,) of the previous step, and whether they are ``loaded`` (m,)."""
+        for padded, values in zip(self._padded, (points, loaded), strict=True):
+            padded[0, : len(values)] = values
+        for mirror, values in zip(
+            self._inputs, (self._padded[0], np.array([len(points)]), self._padded[1]), strict=True
+        ):
+            mirror.put(values)
+
+    def read(self) -> np.ndarray:
+        """Return the selected points."""
+        points, counts = PinnedMirror.get_all(*self._results)
+        return points[0, : counts[0]].astype(int)
 
 
 def _few_cells(

@@ -12,10 +12,10 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 
-from egs_warp.contact.batch_contacts import BatchContacts, BatchDetector, padded
+from egs_warp.contact.batch_contacts import BatchContacts, padded, point_gaps, select_contacts
 from egs_warp.contact.batch_step import BatchLinearization, BatchResult, BatchSolver, StageTimer, no_timer
 from egs_warp.contact.coupled_step import CoupledSolver
-from egs_warp.contact.detection import ContactGeometry, ContactSet
+from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batch_problem import BatchBody, BatchProblem, apply_inverse
 from egs_warp.fem.batched import BatchedRecord, nonzero
@@ -41,16 +41,11 @@ class BatchState(BatchedRecord):
     time: torch.Tensor
     """(c,) s."""
     points: torch.Tensor
-    """(c, K) int64, contact points in use; each world uses the first ``counts`` of the K slots."""
+    """(c, K) int32, contact points in use; each world uses the first ``counts`` of the K slots."""
     counts: torch.Tensor
     """(c,) int32, number of contact points in use."""
     forces: torch.Tensor
     """(c, K, 3) N, in the axes of each contact."""
-
-    @property
-    def valid(self) -> torch.Tensor:
-        """(c, K) bool, True for slots in use."""
-        return torch.arange(self.points.shape[1], device=self.counts.device) < self.counts[:, None]
 
 
 @dataclass(frozen=True)
@@ -105,8 +100,8 @@ class BatchStep(BatchedRecord):
         for world, count in enumerate(counts.tolist()):
             valid = slice(0, count)
             contact_set = ContactSet(
-                *(points[world, valid], nodes[world, valid], weights[world, valid], axes[world, valid]),
-                *(gaps[world, valid], faces[world, valid].astype(np.int32), positions.shape[1]),
+                *(points[world, valid].astype(int), nodes[world, valid], weights[world, valid], axes[world, valid]),
+                *(gaps[world, valid], faces[world, valid], positions.shape[1]),
             )
             report = StepReport(
                 state=BodyState(positions[world], velocities[world], float(times[world])),
@@ -127,7 +122,7 @@ class BatchStep(BatchedRecord):
 
 
 class BatchStepper:
-    """Stepper of many worlds with one body, one set of muscles and one flat ground, each with its own friction.
+    """Stepper of many worlds with one body, one set of muscles and one ground, each with its own friction.
 
     It runs on the device on which the body is assembled: a GPU that torch can use too or, in tests, a CPU.
     """
@@ -156,20 +151,19 @@ class BatchStepper:
             chunk_bytes: bound on the size of the matrices that are factored at a time; several times as much
                 temporary memory is needed in addition.
             stages: context manager that times each stage.
-
-        Raises:
-            ArgumentError: the ground is not flat.
         """
         self.settings = settings or LocomotionSettings()
         self.device = torch.device(str(body.assembly.device))
         count = len(frictions)
         self.body, self.muscles = body, muscles
         near = self.settings.activation_distance * body.height
-        points = ContactSelector(geometry, activation_distance=near, hysteresis=0.1 * near)
+        device = str(self.device)
+        self.detector = ContactDetector(geometry, device=device)
+        self.selector = ContactSelector(geometry, activation_distance=near, hysteresis=0.1 * near, device=device)
         self.common = BatchBody(body, muscles, count, panel=panel, chunk_bytes=chunk_bytes)
-        self.detector = BatchDetector(geometry, points, count, device=self.device)
         self.solver = BatchSolver(
             self.detector,
+            self.selector,
             push_out_cap=self.settings.push_out_cap * body.speed_unit,
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
             tolerance=CoupledSolver.tolerance,
@@ -190,7 +184,7 @@ class BatchStepper:
         """
         count = len(self._frictions)
         capacity = max((len(memory.points) for memory in memories or ()), default=0)
-        points, forces = np.zeros((count, capacity), np.int64), np.zeros((count, capacity, 3))
+        points, forces = np.zeros((count, capacity), np.int32), np.zeros((count, capacity, 3))
         counts = np.zeros(count, np.int32)
         for world, memory in enumerate(memories or ()):
             counts[world] = len(memory.points)
@@ -329,11 +323,12 @@ class BatchStepper:
     ) -> tuple[BatchContacts, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
         """Return the contacts, their forces (c, K, 3) N in the previous step, and gaps and faces at the start."""
         ballistic = state.velocities + problem.dt * self.common.gravity
-        gaps, _ = self.detector.gaps(problem.end_positions(ballistic))
-        chosen = self.detector.select(state.points, state.valid, state.forces[:, :, 0] > 0.0, gaps)
-        start_gaps = self.detector.gaps(state.positions)
-        contacts = self.detector.contacts(chosen, *start_gaps)
-        return contacts, self.detector.transfer_forces(contacts, state.points, state.valid, state.forces), start_gaps
+        gaps, _ = point_gaps(self.detector, problem.end_positions(ballistic))
+        previous = state.points, state.counts, (state.forces[:, :, 0] > 0.0).int()
+        chosen = select_contacts(self.selector, previous, gaps)
+        start_gaps = point_gaps(self.detector, state.positions)
+        contacts = BatchContacts.at(self.detector, *chosen, state.positions, start_gaps)
+        return contacts, contacts.transferred_forces(state.points, state.counts, state.forces), start_gaps
 
     def _predict(
         self,
@@ -399,7 +394,7 @@ class BatchStepper:
     ) -> BatchStep:
         end = problem.end_positions(result.velocities)
         with self._stages("detect"):
-            gaps, _ = self.detector.gaps(end)
+            gaps, _ = point_gaps(self.detector, end)
         internal = problem.internal_gradient(result.velocities, self._stiffness * activations)
         after = BatchState(
             *(state.worlds, end, result.velocities, state.time + problem.dt),

@@ -125,6 +125,7 @@ class LocomotionStepper:
             geometry,
             activation_distance=self.settings.activation_distance * body.height,
             hysteresis=0.1 * self.settings.activation_distance * body.height,
+            device=device,
         )
         self.solver = CoupledSolver(
             self.detector,
@@ -463,7 +464,8 @@ class LocomotionStepper:
         end = problem.end_positions(result.velocities)
         after = BodyState(end, result.velocities, problem.state.time + problem.dt)
         if result.converged:
-            self.linearizer.prefetch_contacts(after, problem.dt, result.contacts.points)
+            loaded = result.forces[:, 0] > 0.0
+            self.linearizer.prefetch_contacts(after, problem.dt, result.contacts.points, loaded)
         if result.penetration is None:
             min_gap = float(self.detector.gaps(end)[0].min())
             internal = problem.internal_gradient(result.velocities, MuscleEnergy.of(self.muscles, plan.activations))
@@ -499,12 +501,12 @@ def _make_linearizer(
     if isinstance(factors, MultifrontalLdl):
         return HostContactLinearizer()
     from egs_warp.contact.device_newton import DeviceContactLinearizer
-    from egs_warp.contact.device_selection import DeviceContactSelector
+    from egs_warp.contact.prefetch import ContactPrefetch
     from egs_warp.fem.tiled_cholesky import TiledCholesky
 
     assert isinstance(factors, TiledCholesky)
-    selector = DeviceContactSelector(solver.detector, solver.points, factors.stream, solver.penetration_tolerance)
-    return DeviceContactLinearizer(factors, body, muscles, selector)
+    prefetch = ContactPrefetch(solver.detector, solver.points, factors.stream, solver.penetration_tolerance)
+    return DeviceContactLinearizer(factors, body, muscles, prefetch)
 
 
 def make_step_linearizer(linearizer: ContactLinearizer, muscles: MuscleSet, synergies: Synergies) -> StepLinearizer:

@@ -35,11 +35,10 @@ of 253 nodes make 101 steps per second in total, and one process makes 21."""
 def choose_batch_size(creature: Creature, jobs: int) -> int:
     """Return the batch size for ``jobs`` batchable jobs: as many as fit on the creature's device.
 
-    Returns 0 if workers are faster for so few jobs, the device is a CPU, torch cannot use it, or the ground is not
-    flat.
+    Returns 0 if workers are faster for so few jobs, the device is a CPU, or torch cannot use it.
     """
     device = creature.body.assembly.device
-    if not device.is_cuda or creature.geometry.field is not None or jobs < _MIN_JOBS_PER_CORE * available_threads():
+    if not device.is_cuda or jobs < _MIN_JOBS_PER_CORE * available_threads():
         return 0
     try:
         import torch

@@ -2,39 +2,48 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from egs_warp.contact.batch_contacts import BatchContacts, BatchDetector
-from egs_warp.contact.detection import ContactDetector, ContactSet
-from egs_warp.contact.selection import ContactSelector
-from egs_warp.pipelines.creature import Creature
+from egs_warp.contact.batch_contacts import (
+    BatchContacts,
+    append_points,
+    penetrating_points,
+    point_gaps,
+    select_contacts,
+)
+from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
+from egs_warp.contact.selection import ACTIVATION_DEPTH, ContactSelector
 from tests.support.creatures import coarse_pawn
+from tests.support.waves import wavy_ground
 
 NEAR, LOWER = 0.02, 0.002
 WORLDS = 4
 
 
-@pytest.fixture(scope="module")
-def creature() -> Creature:
-    return coarse_pawn()
+@pytest.fixture(scope="module", params=["flat", "waves"])
+def geometry(request: pytest.FixtureRequest) -> ContactGeometry:
+    field = wavy_ground(0.004) if request.param == "waves" else None
+    return replace(coarse_pawn().geometry, field=field)
 
 
 @pytest.fixture(scope="module")
-def points(creature: Creature) -> ContactSelector:
-    return ContactSelector(creature.geometry, activation_distance=NEAR, hysteresis=LOWER)
+def points(geometry: ContactGeometry) -> ContactSelector:
+    return ContactSelector(geometry, activation_distance=NEAR, hysteresis=LOWER, device="cpu")
 
 
 @pytest.fixture(scope="module")
-def detector(creature: Creature, points: ContactSelector) -> BatchDetector:
-    return BatchDetector(creature.geometry, points, WORLDS, device=torch.device("cpu"))
+def detector(geometry: ContactGeometry) -> ContactDetector:
+    return ContactDetector(geometry, device="cpu")
 
 
 @pytest.fixture(scope="module")
-def positions(creature: Creature) -> np.ndarray:
+def positions() -> np.ndarray:
     """(4, N, 3) positions of a body that stands, leans, lies deep in the ground, and flies."""
-    nodes, random = creature.start.positions, np.random.default_rng(0)
+    nodes, random = coarse_pawn().start.positions, np.random.default_rng(0)
     lean = nodes + 0.1 * nodes[:, 2:] * np.array([1.0, 0.0, -0.2])
     deep = nodes + 1e-3 * random.normal(size=nodes.shape) - np.array([0.0, 0.0, 0.02])
     return np.stack([nodes, lean, deep, nodes + np.array([0.0, 0.0, 1.0])])
@@ -44,55 +53,54 @@ def points_of(contacts: BatchContacts, world: int) -> np.ndarray:
     return contacts.points[world, : int(contacts.counts[world])].numpy()
 
 
-def alone(creature: Creature, chosen: list[np.ndarray], positions: np.ndarray) -> list[ContactSet]:
-    one = ContactDetector(creature.geometry, device="cpu")
-    return [one.contact_set(each, place) for each, place in zip(chosen, positions, strict=True)]
+def contacts_within(detector: ContactDetector, positions: np.ndarray, distance: float) -> BatchContacts:
+    """The contacts of all points closer than ``distance`` to the ground."""
+    places = torch.from_numpy(positions)
+    gaps, faces = point_gaps(detector, places)
+    order = torch.argsort((gaps >= distance).int(), dim=1, stable=True).int()
+    return BatchContacts.at(detector, order, (gaps < distance).sum(dim=1).int(), places, (gaps, faces))
 
 
 def test_selection_equals_that_of_one_world_in_every_step(
-    creature: Creature, points: ContactSelector, detector: BatchDetector, positions: np.ndarray
+    points: ContactSelector, detector: ContactDetector, positions: np.ndarray
 ) -> None:
     """In three steps, points are added, retained because of their load, removed, and joined by deeper ones."""
     random = np.random.default_rng(1)
     before = [np.zeros(0, int)] * WORLDS
     loads, joins = [np.zeros(0)] * WORLDS, 0
-    one = ContactDetector(creature.geometry, device="cpu")
     for lifted in (0.0, 0.012, 0.025):
         places = positions + np.array([0.0, 0.0, lifted])
-        gaps, faces = detector.gaps(torch.from_numpy(places))
+        start = point_gaps(detector, torch.from_numpy(places))
+        gaps, _ = start
         most = max(map(len, before))
-        previous, loaded = torch.zeros((WORLDS, most), dtype=torch.int64), torch.zeros((WORLDS, most), dtype=torch.bool)
-        there = torch.arange(most) < torch.tensor([[len(each)] for each in before])
+        previous, loaded = torch.zeros((WORLDS, most), dtype=torch.int32), torch.zeros((WORLDS, most), dtype=torch.bool)
+        counts = torch.tensor([len(each) for each in before], dtype=torch.int32)
         for world, (its, load) in enumerate(zip(before, loads, strict=True)):
             previous[world, : len(its)], loaded[world, : len(its)] = torch.from_numpy(its), torch.from_numpy(load > 0.0)
-        contacts = detector.contacts(detector.select(previous, there, loaded, gaps), gaps, faces)
+        chosen = select_contacts(points, (previous, counts, loaded.int()), gaps)
+        contacts = BatchContacts.at(detector, *chosen, torch.from_numpy(places), start)
         for world, place in enumerate(places):
-            expected = points.select(before[world], loads[world] > 0.0, one.gaps(place)[0])
+            expected = points.select(before[world], loads[world] > 0.0, detector.gaps(place)[0])
             assert np.array_equal(points_of(contacts, world), expected)
         # Without noise, all points of a cell would be equally deep.
         noisy = gaps + 0.01 * torch.from_numpy(random.normal(size=gaps.shape))
-        deep = detector.find_deeper(contacts, noisy, 0.005)
-        added = detector.contacts(deep, gaps, faces, order=noisy)
-        forces = torch.from_numpy(random.uniform(0.1, 1.0, (*contacts.points.shape, 3))) * contacts.valid[:, :, None]
-        joined, wide = detector.append_contacts(contacts, forces, added)
+        tolerance = 0.005 / ACTIVATION_DEPTH
+        lowest = penetrating_points(points, contacts, (noisy, gaps), tolerance)
+        more = append_points(points, contacts, lowest, noisy)
+        joined = BatchContacts.at(detector, *more, torch.from_numpy(places), start)
         for world in range(WORLDS):
-            new = points.find_deeper(points_of(contacts, world), noisy[world].numpy(), 0.005)
-            assert np.array_equal(points_of(added, world), new)
+            its = points_of(contacts, world)
+            new = points.find_penetrating(its, noisy[world].numpy(), gaps[world].numpy(), tolerance)
             joins += len(new)
-            assert np.array_equal(points_of(joined, world), np.concatenate([points_of(contacts, world), new]))
-            count = int(contacts.counts[world])
-            assert torch.equal(wide[world, :count], forces[world, :count]) and not wide[world, count:].any()
+            assert np.array_equal(points_of(joined, world), np.concatenate([its, new]))
         before = [points_of(joined, world) for world in range(WORLDS)]
         loads = [np.where(random.random(len(each)) < 0.5, 1.0, 0.0) for each in before]
     assert joins > 0 and len(before[0]) > 0 and len({len(each) for each in before}) > 1
 
 
-def test_frames_speeds_and_pushes_are_those_of_one(
-    creature: Creature, detector: BatchDetector, positions: np.ndarray
-) -> None:
-    gaps, faces = detector.gaps(torch.from_numpy(positions))
-    contacts = detector.contacts(gaps < 0.003, gaps, faces)
-    sets = alone(creature, [points_of(contacts, world) for world in range(WORLDS)], positions)
+def test_frames_speeds_and_pushes_are_those_of_one(detector: ContactDetector, positions: np.ndarray) -> None:
+    contacts = contacts_within(detector, positions, 0.003)
+    sets: list[ContactSet] = [detector.contact_set(points_of(contacts, w), positions[w]) for w in range(WORLDS)]
     assert sets[3].count == 0 and min(one.count for one in sets[:3]) > 3
     random, nodes = np.random.default_rng(2), positions.shape[1]
     velocities = random.normal(size=(WORLDS, 3 * nodes, 2))
@@ -119,12 +127,19 @@ def test_frames_speeds_and_pushes_are_those_of_one(
         assert np.array_equal(contacts.faces[world, :count].numpy(), one.faces)
 
 
-def test_forces_follow_their_points(detector: BatchDetector, positions: np.ndarray) -> None:
-    gaps, faces = detector.gaps(torch.from_numpy(positions))
-    now = detector.contacts(gaps < 0.003, gaps, faces)
-    then = detector.contacts(gaps < 0.004, gaps, faces)
+def test_padding_of_contacts_is_zero(detector: ContactDetector, positions: np.ndarray) -> None:
+    contacts = contacts_within(detector, positions, 0.003)
+    wide = contacts.with_capacity(contacts.capacity + 2)
+    assert wide.gaps[wide.valid].all() and int(wide.valid.sum()) == int(wide.counts.sum())
+    for values in (wide.weights, wide.axes, wide.gaps, wide.faces, wide.nodes):
+        assert not values[~wide.valid].any()
+
+
+def test_forces_follow_their_points(detector: ContactDetector, positions: np.ndarray) -> None:
+    now = contacts_within(detector, positions, 0.003)
+    then = contacts_within(detector, positions, 0.004)
     forces = torch.from_numpy(np.random.default_rng(3).normal(size=(WORLDS, then.capacity, 3)))
-    matched = detector.transfer_forces(now, then.points, then.valid, forces).numpy()
+    matched = now.transferred_forces(then.points, then.counts, forces).numpy()
     for world in range(WORLDS):
         count, last = int(now.counts[world]), int(then.counts[world])
         expected = ContactSelector.transfer_forces(

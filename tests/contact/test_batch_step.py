@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from egs_warp.contact.batch_contacts import BatchContacts, BatchDetector
+from egs_warp.contact.batch_contacts import BatchContacts, point_gaps
 from egs_warp.contact.batch_step import BatchResult, BatchSolver
 from egs_warp.contact.coupled_step import ContactLinearization, CoupledResult, CoupledSolver
-from egs_warp.contact.detection import push_out_speeds
+from egs_warp.contact.detection import ContactDetector, push_out_speeds
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batch_problem import BatchBody, BatchProblem
 from egs_warp.fem.body import BodyState
@@ -64,18 +64,22 @@ def solved_alone(
     )
 
 
+def lowest_points(points: ContactSelector, gaps: np.ndarray) -> np.ndarray:
+    """The lowest point of each cell that is below the ground, in ascending order."""
+    high = np.full_like(gaps, np.inf)
+    return np.sort(points.find_penetrating(np.zeros(0, int), gaps, high, 1e-12))
+
+
 def solved_together(
     creature: Creature, states: list[BodyState], activations: np.ndarray, dt: float, *, few: bool = False
 ) -> tuple[BatchContacts, BatchContacts, BatchResult]:
     """Return the contacts at the start and at the end, and the result. The start contacts are the points that touch the
     ground in free motion; with ``few`` only a third of them."""
-    one, device, count = creature.stepper.solver, torch.device("cpu"), len(states)
-    points = ContactSelector(
-        creature.geometry, activation_distance=one.points.activation_distance, hysteresis=one.points.hysteresis
-    )
-    detector = BatchDetector(creature.geometry, points, count, device=device)
+    one, count = creature.stepper.solver, len(states)
+    detector = ContactDetector(creature.geometry, device="cpu")
     beside = BatchSolver(
         detector,
+        one.points,
         push_out_cap=one.push_out_cap,
         penetration_tolerance=one.penetration_tolerance,
         tolerance=CoupledSolver.tolerance,
@@ -85,12 +89,15 @@ def solved_together(
     )
     common = BatchBody(creature.body, creature.muscles, count)
     problem = BatchProblem.at(common, torch.arange(count), positions, velocities, dt=dt, drag=DRAG)
-    begun = detector.gaps(positions)
-    ends, _ = detector.gaps(problem.end_positions(velocities + dt * common.gravity))
-    near = detector.find_deeper(detector.contacts(ends < -1e9, *begun), ends, 0.0)
-    if few:
-        near &= torch.arange(near.shape[1]) % 3 == 0
-    contacts = detector.contacts(near, *begun)
+    begun = point_gaps(detector, positions)
+    ends, _ = point_gaps(detector, problem.end_positions(velocities + dt * common.gravity))
+    near = [lowest_points(one.points, gaps.numpy()) for gaps in ends]
+    near = [each[each % 3 == 0] if few else each for each in near]
+    counts = torch.tensor([len(each) for each in near], dtype=torch.int32)
+    points = torch.zeros((count, int(counts.max())), dtype=torch.int32)
+    for row, each in zip(points, near, strict=True):
+        row[: len(each)] = torch.from_numpy(each)
+    contacts = BatchContacts.at(detector, points, counts, positions, begun)
     assert problem.factor(problem.rigid_guess, None).all()
     touched, made = beside.solve(
         *(problem, contacts, beside.linearize(problem, contacts)),
@@ -99,7 +106,7 @@ def solved_together(
         forces=torch.zeros((count, contacts.capacity, 3), dtype=torch.float64),
         start_gaps=begun,
     )
-    assert torch.equal(contacts.counts, near.sum(dim=1).int())
+    assert torch.equal(contacts.counts, counts)
     return contacts, touched, made
 
 
@@ -174,14 +181,12 @@ def test_a_world_without_a_usable_tangent_stops_at_once(creature: Creature) -> N
 def test_normal_bias_equals_that_of_one_world(creature: Creature, states: list[BodyState]) -> None:
     """The push-out speeds are equal up to the cap; capacity without a contact has no bias."""
     one, dt = creature.stepper.solver, 0.01
-    points = ContactSelector(
-        creature.geometry, activation_distance=one.points.activation_distance, hysteresis=one.points.hysteresis
-    )
-    detector = BatchDetector(creature.geometry, points, 2, device=torch.device("cpu"))
-    beside = BatchSolver(detector, push_out_cap=0.05, penetration_tolerance=0.01, tolerance=1e-8)
+    detector = ContactDetector(creature.geometry, device="cpu")
+    beside = BatchSolver(detector, one.points, push_out_cap=0.05, penetration_tolerance=0.01, tolerance=1e-8)
     nodes = torch.from_numpy(np.stack([states[0].positions, states[0].positions - np.array([0.0, 0.0, 0.03])]))
-    gaps, faces = detector.gaps(nodes)
-    contacts = detector.contacts(gaps < 0.003, gaps, faces)
+    gaps, faces = point_gaps(detector, nodes)
+    order = torch.argsort((gaps >= 0.003).int(), dim=1, stable=True).int()
+    contacts = BatchContacts.at(detector, order, (gaps < 0.003).sum(dim=1).int(), nodes, (gaps, faces))
     made = beside.normal_bias(contacts, dt).numpy()
     counts = contacts.counts.tolist()
     assert counts[0] < counts[1]

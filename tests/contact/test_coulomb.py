@@ -12,8 +12,8 @@ import torch
 import warp as wp
 
 from egs_warp.contact import coulomb, newton
-from egs_warp.contact.batch_contacts import coulomb_forces_batch
 from egs_warp.contact.coulomb import coulomb_forces, pack_contacts
+from egs_warp.contact.device_coulomb import coulomb_forces_batch
 from egs_warp.kernels.contact.coulomb import sweeps_kernel
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.simulated_run import simulate

@@ -194,7 +194,7 @@ def test_contacts_do_not_depend_on_the_prefetch(
         loaded, (gaps, _) = np.ones(len(before), bool), stepper.detector.gaps(ballistic)
         expected = stepper.selector.select(before, loaded, gaps)
         for ahead, points in [*steps, (problem, np.arange(2))]:
-            stepper.linearizer.prefetch_contacts(ahead.state, ahead.dt, points)
+            stepper.linearizer.prefetch_contacts(ahead.state, ahead.dt, points, np.ones(len(points), bool))
             found = stepper.linearizer.select_contacts(problem, before, loaded)
             assert found is not None and np.array_equal(found.points, expected)
         seen.add(tuple(expected))

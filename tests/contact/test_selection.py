@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from egs_warp.contact.detection import ContactGeometry
-from egs_warp.contact.selection import MAX_CELLS_AT_REST, ContactSelector
+from egs_warp.contact.selection import ACTIVATION_DEPTH, MAX_CELLS_AT_REST, MAX_CREEP, MAX_SINK, ContactSelector
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.geometry.plane import Plane
 from tests.support.meshes import block_mesh
@@ -64,7 +64,7 @@ def test_forces_follow_their_points_and_deep_points_are_added(geometry: ContactG
     matched = points.transfer_forces(np.array([3, 5, 7]), before, forces)
     assert np.array_equal(matched, [[3, 4, 5], [0, 0, 0], [0, 1, 2]])
     gaps = gaps_of(geometry) - 0.006
-    deep = points.find_deeper(np.array([int(np.argmin(gaps))]), gaps, 0.005)
+    deep = points.find_penetrating(np.array([int(np.argmin(gaps))]), gaps, gaps + 1.0, 0.005 / ACTIVATION_DEPTH)
     assert len(deep) and (gaps[deep] < -0.005).all() and int(np.argmin(gaps)) not in deep
 
 
@@ -98,6 +98,34 @@ def test_rounding_changes_neither_cells_nor_points(geometry: ContactGeometry) ->
     for _ in range(5):
         shaken = gaps + 1e-15 * random.standard_normal(gaps.shape)
         assert np.array_equal(other.select(*none, shaken), chosen)
-        assert np.array_equal(
-            points.find_deeper(chosen, shaken - 0.02, 0.01), points.find_deeper(chosen, gaps - 0.02, 0.01)
-        )
+        deep = [points.find_penetrating(chosen, each - 0.02, each, 0.01 / ACTIVATION_DEPTH) for each in (shaken, gaps)]
+        assert np.array_equal(deep[0], deep[1]) and len(deep[0]) > 0
+
+
+def test_selection_follows_its_rules_in_random_steps(geometry: ContactGeometry, device: str) -> None:
+    """Both selections equal a loop over the cells, in 20 steps that start from the points of the step before."""
+    points = ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3, device=device)
+    random, sunk, depth = np.random.default_rng(1), 0, 0.002
+    previous, loaded, start = np.zeros(0, int), np.zeros(0, bool), gaps_of(geometry)
+    for _ in range(20):
+        gaps = gaps_of(geometry, random.uniform(-0.05, 0.05)) + random.normal(0.004, 0.004, len(start))
+        chosen, deepest = [], []
+        for cell in range(points.cell_count):
+            members = np.flatnonzero(points.cell_from_point == cell)
+            lowest = members[np.argmin(gaps[members])]
+            low = gaps[lowest] if gaps[lowest] < NEAR else np.inf
+            mine = [(p, load) for p, load in zip(previous, loaded, strict=True) if p in members]
+            held = [p for p, load in mine if gaps[p] < 2.0 * NEAR and (load or gaps[p] <= low + 1e-3)]
+            chosen += held or [lowest] * int(low < np.inf)
+        found = points.select(previous, loaded, gaps)
+        assert found.tolist() == sorted(chosen)
+        allowed = np.where(gaps < -depth, MAX_CREEP, MAX_SINK) * depth
+        sinks = (gaps < -ACTIVATION_DEPTH * depth) & (gaps < start - allowed) & ~np.isin(np.arange(len(gaps)), found)
+        for cell in range(points.cell_count):
+            members = np.flatnonzero(sinks & (points.cell_from_point == cell))
+            deepest += members[np.argsort(gaps[members])][:1].tolist()
+        joining = points.find_penetrating(found, gaps, start, depth)
+        assert joining.tolist() == sorted(deepest, key=lambda point: gaps[point])
+        sunk += len(joining)
+        previous, loaded, start = found, random.random(len(found)) < 0.5, gaps
+    assert sunk > 20

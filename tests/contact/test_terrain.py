@@ -134,7 +134,7 @@ def test_the_kernel_equals_its_twin(device: str) -> None:
     contacts = detector.contact_set(np.arange(len(points)), x)
     on_ground = faces == 0
     assert np.array_equal(contacts.faces, faces)
-    assert np.array_equal(contacts.axes[on_ground], field.frames(points[on_ground]))
+    assert np.abs(contacts.axes[on_ground] - field.frames(points[on_ground])).max() < 1e-14
     assert np.allclose(contacts.axes[~on_ground, 0], [-1.0, 0.0, 0.0])
 
 

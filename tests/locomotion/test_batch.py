@@ -9,9 +9,7 @@ import pytest
 import torch
 
 from egs_warp.contact.detection import ContactGeometry
-from egs_warp.errors import ArgumentError
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.geometry.height_field import HeightField
 from egs_warp.locomotion.batch import BatchStepper
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
@@ -21,6 +19,7 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn
+from tests.support.waves import wavy_ground
 
 FRICTIONS = (0.8, 0.3, 1.2)
 STRENGTHS = (1.0, 0.9, 0.5)
@@ -40,18 +39,13 @@ def jump(creature: Creature) -> Trajectory:
     return simulate(creature, motion("jump"), frames=FIRST + STEPS + 1).trajectory
 
 
-def alone(creature: Creature, friction: float) -> LocomotionStepper:
-    geometry = replace(creature.geometry, friction=friction)
-    return LocomotionStepper(creature.body, creature.muscles, geometry, device="cpu")
-
-
 def runs_alone(
     creature: Creature, starts: list[BodyState], activations: np.ndarray, dt: float
 ) -> list[list[list[StepReport]]]:
     """Return the reports of each world and each step of ``activations`` (steps, worlds, M)."""
     runs = []
     for world, (friction, state) in enumerate(zip(FRICTIONS, starts, strict=True)):
-        stepper = alone(creature, friction)
+        stepper = creature.stepper.with_friction(friction)
         memory, reports = stepper.initial_memory(), []
         for given in activations[:, world]:
             state, memory, done = stepper.advance_with_activations(state, memory, given, dt)
@@ -116,8 +110,30 @@ def test_each_world_equals_a_single_run(creature: Creature, jump: Trajectory) ->
     assert apart > 1e-4 * creature.body.height
 
 
+def test_each_world_on_uneven_ground_equals_a_single_run(creature: Creature, jump: Trajectory) -> None:
+    """8 steps from above waves, on which the body lands and leans."""
+    dt, _ = solver_steps(creature.body)
+    geometry = replace(creature.geometry, field=wavy_ground(0.02 * creature.body.height, spacing=0.04, reach=1.0))
+    there = replace(creature, stepper=LocomotionStepper(creature.body, creature.muscles, geometry, device="cpu"))
+    nodes = jump.positions[FIRST]
+    gaps, _ = there.stepper.detector.gaps(nodes)
+    start = BodyState(nodes - np.array([0.0, 0.0, gaps.min()]), np.zeros_like(nodes))
+    activations = np.stack([strength * jump.activations[FIRST:][:8] for strength in STRENGTHS], axis=1)
+    expected = runs_alone(there, [start] * 3, activations, dt)
+    made = runs_together(BatchStepper(*parts(there), FRICTIONS), [start] * 3, activations, dt)
+    slopes = []
+    for run, its in zip(made, expected, strict=True):
+        for reports, others in zip(run, its, strict=True):
+            assert len(reports) == len(others) > 0
+            for one, other in zip(reports, others, strict=True):
+                check(creature, one, other)
+                slopes += np.linalg.norm(one.contacts.axes[one.forces[:, 0] > 0.0, 0, :2], axis=1).tolist()
+    # The body was carried by ground that leans in different directions.
+    assert len(slopes) > 40 and np.ptp(slopes) > 0.05
+
+
 def parts(creature: Creature) -> tuple[SoftBody, MuscleSet, ContactGeometry]:
-    return creature.body, creature.muscles, creature.geometry
+    return creature.body, creature.muscles, creature.stepper.geometry
 
 
 def on_its_rim(geometry: ContactGeometry, count: int = 12) -> ContactGeometry:
@@ -152,7 +168,7 @@ def test_a_world_continues_from_its_last_step(creature: Creature, jump: Trajecto
     begun = [BodyState(jump.positions[step], jump.velocities[step]) for step in (FIRST, FIRST + 1)]
     steppers, memories, states, expected = [], [], [], []
     for state, friction in zip(begun, FRICTIONS, strict=False):
-        steppers.append(alone(creature, friction))
+        steppers.append(creature.stepper.with_friction(friction))
         state, memory, _ = steppers[-1].advance_with_activations(
             state, steppers[-1].initial_memory(), jump.activations[FIRST], dt
         )
@@ -247,10 +263,3 @@ def test_a_world_that_never_converges_is_reported(creature: Creature, monkeypatc
     given = np.zeros((3, creature.muscles.segment_count))
     state, done, lost = stepper.advance(stepper.start([creature.start] * 3), given, dt)
     assert lost.all() and len(state.worlds) == 0 and done == []
-
-
-def test_ground_that_is_not_flat_is_refused(creature: Creature) -> None:
-    ground = HeightField(np.eye(3), np.zeros(3), 1.0, np.zeros((3, 3)))
-    geometry = replace(creature.geometry, field=ground)
-    with pytest.raises(ArgumentError, match=r"^geometry: batched worlds need flat ground; run these jobs in "):
-        BatchStepper(creature.body, creature.muscles, geometry, FRICTIONS)

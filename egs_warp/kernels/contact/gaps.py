@@ -8,30 +8,38 @@ from egs_warp.precision import Vec3, Vec4, real
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.func
+def embedded_point(tet: wp.vec4i, w: Vec4, positions: wp.array2d[Vec3], world: int):
+    """Return the position of the point with the weights ``w`` in the tetrahedron of the nodes ``tet``."""
+    return (
+        w[0] * positions[world, tet[0]]
+        + w[1] * positions[world, tet[1]]
+        + w[2] * positions[world, tet[2]]
+        + w[3] * positions[world, tet[3]]
+    )
+
+
 @wp.kernel
 def point_gaps_kernel(
     # Model:
-    tets: wp.array[wp.vec4i],
-    tet_from_point: wp.array[int],
+    nodes: wp.array[wp.vec4i],
     weights: wp.array[Vec4],
     planes: wp.array[Vec4],
     solid_from_plane: wp.array[int],
     # In:
-    positions: wp.array[Vec3],
+    positions: wp.array2d[Vec3],
     # Out:
-    gaps_out: wp.array[real],
-    planes_out: wp.array[int],
+    gaps_out: wp.array2d[real],
+    planes_out: wp.array2d[int],
 ):
-    """Compute the signed distance of each embedded point to the nearest solid, and the plane of that solid with the
-    largest signed distance.
+    """Compute the signed distance of each embedded point of each world to the nearest solid, and the plane of that
+    solid with the largest signed distance.
 
     The planes of a solid, which is their intersection, are consecutive. The largest signed distance to them is taken as
     the distance to the solid, of which it is a lower bound.
     """
-    point = wp.tid()
-    tet = tets[tet_from_point[point]]
-    w = weights[point]
-    x = w[0] * positions[tet[0]] + w[1] * positions[tet[1]] + w[2] * positions[tet[2]] + w[3] * positions[tet[3]]
+    world, point = wp.tid()
+    x = embedded_point(nodes[point], weights[point], positions, world)
     nearest_gap = real(wp.inf)
     nearest = int(0)
     solid_gap = real(-wp.inf)
@@ -50,15 +58,18 @@ def point_gaps_kernel(
                 nearest_gap = solid_gap
                 nearest = facing
             solid_gap = real(-wp.inf)
-    gaps_out[point] = nearest_gap
-    planes_out[point] = nearest
+    gaps_out[world, point] = nearest_gap
+    planes_out[world, point] = nearest
 
 
 @wp.func_native(
     on_cpu(
         """
-    const int planes_count = planes.shape[0], nodes_count = positions.shape[0], points = nodes.shape[0];
-    const double *const x = (const double*)positions.data, *const w = (const double*)weights.data;
+    const int planes_count = planes.shape[0], nodes_count = positions.shape[1], points = nodes.shape[0];
+    const double* const x = (const double*)positions.data + 3 * (size_t)world * nodes_count;
+    const double* const w = (const double*)weights.data;
+    double* const gaps = gaps_out.data + (size_t)world * points;
+    int* const nearest_planes = planes_out.data + (size_t)world * points;
     double* const height = heights.data;
     const int* const corners = (const int*)nodes.data;
     for (int p = 0; p < planes_count; ++p) {
@@ -88,8 +99,8 @@ def point_gaps_kernel(
                 solid_gap = -__builtin_inf();
             }
         }
-        gaps_out.data[i] = nearest_gap;
-        planes_out.data[i] = nearest;
+        gaps[i] = nearest_gap;
+        nearest_planes[i] = nearest;
     }
 """
     )
@@ -99,12 +110,13 @@ def write_gaps(
     weights: wp.array[Vec4],
     planes: wp.array[Vec4],
     solid_from_plane: wp.array[int],
-    positions: wp.array[Vec3],
+    positions: wp.array2d[Vec3],
+    world: int,
     heights: wp.array[real],
-    gaps_out: wp.array[real],
-    planes_out: wp.array[int],
+    gaps_out: wp.array2d[real],
+    planes_out: wp.array2d[int],
 ) -> None:
-    """Compute the gaps of all points (native code of ``all_gaps_kernel``)."""
+    """Compute the gaps of all points of a world (native code of ``all_gaps_kernel``)."""
     ...
 
 
@@ -116,14 +128,14 @@ def all_gaps_kernel(
     planes: wp.array[Vec4],
     solid_from_plane: wp.array[int],
     # In:
-    positions: wp.array[Vec3],
+    positions: wp.array2d[Vec3],
     # Out:
     heights: wp.array[real],
-    gaps_out: wp.array[real],
-    planes_out: wp.array[int],
+    gaps_out: wp.array2d[real],
+    planes_out: wp.array2d[int],
 ):
-    """Do the same as ``point_gaps_kernel`` for all points in one CPU thread, each point on four ``nodes``.
+    """Do the same as ``point_gaps_kernel`` for all points of a world in one CPU thread. Arrays must be contiguous.
     ``heights`` is a workspace of planes times nodes for the signed distances of the nodes, which are interpolated
-    linearly.
+    linearly; the worlds of a launch on a CPU run one after the other and share it.
     """
-    write_gaps(nodes, weights, planes, solid_from_plane, positions, heights, gaps_out, planes_out)
+    write_gaps(nodes, weights, planes, solid_from_plane, positions, wp.tid(), heights, gaps_out, planes_out)

@@ -1,7 +1,8 @@
-"""Kernel of contact detection between embedded points and a height field (Eq. 8)."""
+"""Contact detection between embedded points and a height field (Eq. 8): gaps and frames."""
 
 import warp as wp
 
+from egs_warp.kernels.contact.gaps import embedded_point
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -22,32 +23,9 @@ def spline_slopes(f: real):
     return Vec3(f - real(0.5), -real(2.0) * f, f + real(0.5))
 
 
-@wp.kernel
-def ground_gaps_kernel(
-    # Model:
-    tets: wp.array[wp.vec4i],
-    tet_from_point: wp.array[int],
-    weights: wp.array[Vec4],
-    axes: Mat33,
-    origin: Vec3,
-    spacing: real,
-    coefficients: wp.array2d[real],
-    # In:
-    positions: wp.array[Vec3],
-    # In and out:
-    gaps: wp.array[real],
-    faces: wp.array[int],
-):
-    """Compute the distance of each embedded point to the tangent plane of the ground below it, and merge it into
-    ``gaps``.
-
-    Where the ground is nearer than the obstacle in ``gaps``, its distance is stored and ``faces`` becomes 0. Elsewhere
-    ``faces`` is incremented by 1, since the ground is face 0.
-    """
-    point = wp.tid()
-    tet = tets[tet_from_point[point]]
-    w = weights[point]
-    x = w[0] * positions[tet[0]] + w[1] * positions[tet[1]] + w[2] * positions[tet[2]] + w[3] * positions[tet[3]]
+@wp.func
+def height_and_slopes(axes: Mat33, origin: Vec3, spacing: real, coefficients: wp.array2d[real], x: Vec3):
+    """Return the height of ``x`` over the ground along the third axis, and the two slopes of the ground there."""
     away = axes * (x - origin)
     u = away[0] / spacing
     v = away[1] / spacing
@@ -69,11 +47,46 @@ def ground_gaps_kernel(
             height += along[j] * across[i] * c
             first += along[j] * across_slope[i] * c
             second += along_slope[j] * across[i] * c
-    first = first / spacing
-    second = second / spacing
-    gap = (away[2] - height) / wp.sqrt(real(1.0) + first * first + second * second)
-    if gap <= gaps[point]:
-        gaps[point] = gap
-        faces[point] = 0
+    return Vec3(away[2] - height, first / spacing, second / spacing)
+
+
+@wp.func
+def ground_frame(axes: Mat33, first: real, second: real):
+    """Return the contact frame of ground with these slopes along the first two ``axes``: the rows are the normal and
+    two tangents, which vary continuously with the slopes.
+    """
+    normal = Vec3(-first, -second, real(1.0)) / wp.sqrt(real(1.0) + first * first + second * second)
+    along = Vec3(real(1.0), real(0.0), first) / wp.sqrt(real(1.0) + first * first)
+    return wp.matrix_from_rows(normal, along, wp.cross(normal, along)) * axes
+
+
+@wp.kernel
+def ground_gaps_kernel(
+    # Model:
+    nodes: wp.array[wp.vec4i],
+    weights: wp.array[Vec4],
+    axes: Mat33,
+    origin: Vec3,
+    spacing: real,
+    coefficients: wp.array2d[real],
+    # In:
+    positions: wp.array2d[Vec3],
+    # In and out:
+    gaps: wp.array2d[real],
+    faces: wp.array2d[int],
+):
+    """Compute the distance of each embedded point of each world to the tangent plane of the ground below it, and merge
+    it into ``gaps``.
+
+    Where the ground is nearer than the obstacle in ``gaps``, its distance is stored and ``faces`` becomes 0. Elsewhere
+    ``faces`` is incremented by 1, since the ground is face 0.
+    """
+    world, point = wp.tid()
+    x = embedded_point(nodes[point], weights[point], positions, world)
+    ground = height_and_slopes(axes, origin, spacing, coefficients, x)
+    gap = ground[0] / wp.sqrt(real(1.0) + ground[1] * ground[1] + ground[2] * ground[2])
+    if gap <= gaps[world, point]:
+        gaps[world, point] = gap
+        faces[world, point] = 0
     else:
-        faces[point] = faces[point] + 1
+        faces[world, point] = faces[world, point] + 1

@@ -1,14 +1,34 @@
-"""Kernels of contact selection: reductions of the gaps of all points on a GPU (Eq. 8)."""
+"""Kernels of contact selection: the lowest point of each cell, hysteresis, and points that penetrate too far (Eq. 8).
+
+All have a leading world axis. On a GPU ``BLOCK`` threads share a cell or a world, on a CPU one thread computes it.
+"""
 
 import warp as wp
 
-from egs_warp.kernels.block import block_max, sync_block
-from egs_warp.precision import Vec4, real
+from egs_warp.kernels.block import block_max, sum_of_block, sync_block
+from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 64
-"""Number of threads for each cell on a GPU."""
+"""Number of threads for each cell, or for each world, on a GPU."""
+
+
+@wp.func
+def lowest_of_block(order: wp.array[int], height: real, first: real):
+    """Return the point of the block with the lowest ``height``, of several the first in ``order``, or -1.
+
+    Each thread passes its lowest height and the position in ``order`` of its first point there, infinite if it has no
+    point.
+    """
+    lowest_height = -block_max(-height)
+    sync_block()
+    if height > lowest_height:
+        first = real(wp.inf)
+    first = -block_max(-first)
+    if first < real(wp.inf):
+        return order[int(first)]
+    return int(-1)
 
 
 @wp.kernel
@@ -19,94 +39,176 @@ def lowest_point_per_cell_kernel(
     near: real,
     gap_tolerance: real,
     # In:
-    gaps: wp.array[real],
-    start_gaps: wp.array[real],
-    start_faces: wp.array[int],
+    gaps: wp.array2d[real],
     # Out:
-    lowest_out: wp.array[Vec4],
+    lowest_out: wp.array2d[int],
 ):
-    """Find the lowest point of each cell among those closer than ``near``, as ``ContactSelector`` does.
+    """Find the lowest point of each cell among those closer than ``near``; -1 if there is none.
 
     The points of a cell are ``order[bounds[cell]:bounds[cell + 1]]``. Gaps that are equal within ``gap_tolerance`` tie,
-    and the first point in ``order`` wins. The output is the point's index, -1 if there is none, its gap, and its gap
-    and face at the start of the step.
+    and the first point in ``order`` wins.
     """
-    cell, lane = wp.tid()
+    world, cell, lane = wp.tid()
     min_height = real(wp.inf)
     first = real(wp.inf)
     for k in range(bounds[cell] + lane, bounds[cell + 1], wp.block_dim()):
-        gap = gaps[order[k]]
+        gap = gaps[world, order[k]]
         if gap < near:
             height = wp.rint(gap / gap_tolerance)
             if height < min_height:
                 min_height = height
                 first = real(k)
-    min_height_of_cell = -block_max(-min_height)
-    sync_block()
-    if min_height > min_height_of_cell:
-        first = real(wp.inf)
-    first = -block_max(-first)
+    point = lowest_of_block(order, min_height, first)
     if lane == 0:
-        result = Vec4(real(-1.0), real(0.0), real(0.0), real(0.0))
-        if first < real(wp.inf):
-            point = order[int(first)]
-            result = Vec4(real(point), gaps[point], start_gaps[point], real(start_faces[point]))
-        lowest_out[cell] = result
-
-
-@wp.kernel
-def gather_gaps_kernel(
-    # In:
-    points: wp.array[real],
-    gaps: wp.array[real],
-    start_gaps: wp.array[real],
-    start_faces: wp.array[int],
-    # Out:
-    gathered_out: wp.array[Vec4],
-):
-    """Write index, gap, and gap and face at the start of the step of the given ``points``."""
-    k = wp.tid()
-    point = int(points[k])
-    gathered_out[k] = Vec4(points[k], gaps[point], start_gaps[point], real(start_faces[point]))
+        lowest_out[world, cell] = point
 
 
 @wp.kernel
 def penetrating_points_kernel(
     # Model:
+    order: wp.array[int],
+    bounds: wp.array[int],
+    gap_tolerance: real,
     depth: real,
     tolerance: real,
     max_sink: real,
     max_creep: real,
     # In:
-    points: wp.array[int],
+    points: wp.array2d[int],
     counts: wp.array[int],
-    gaps: wp.array[real],
-    start_gaps: wp.array[real],
+    gaps: wp.array2d[real],
+    start_gaps: wp.array2d[real],
     # In and out:
     penetrating: wp.array[real],
     # Out:
-    deep_out: wp.array[real],
+    lowest_out: wp.array2d[int],
 ):
-    """Count the points that penetrate too far (see ``CoupledSolver``) and are not among the first ``counts[0]``
-    ``points``.
+    """Count the points of each world that penetrate too far and are not among its first ``counts`` ``points``, and find
+    the lowest of them in each cell, as ``lowest_point_per_cell_kernel`` does.
 
     A point is counted if it is deeper than ``depth`` metres and has sunk by more than ``tolerance`` times ``max_sink``,
-    or times ``max_creep`` if it is deeper than ``tolerance``. ``deep_out`` has the gaps of these points, 0 for all
-    others.
+    or times ``max_creep`` if it is deeper than ``tolerance``.
     """
-    point = wp.tid()
-    gap = gaps[point]
-    deep = real(0.0)
-    if gap < -depth:
-        allowed = max_sink * tolerance
-        if gap < -tolerance:
-            allowed = max_creep * tolerance
-        if gap < start_gaps[point] - allowed:
-            is_active = int(0)
-            for k in range(counts[0]):
-                if points[k] == point:
-                    is_active = 1
-            if is_active == 0:
-                wp.atomic_add(penetrating, 0, real(1.0))
-                deep = gap
-    deep_out[point] = deep
+    world, cell, lane = wp.tid()
+    min_height = real(wp.inf)
+    first = real(wp.inf)
+    found = real(0.0)
+    for k in range(bounds[cell] + lane, bounds[cell + 1], wp.block_dim()):
+        point = order[k]
+        gap = gaps[world, point]
+        if gap < -depth:
+            allowed = max_sink * tolerance
+            if gap < -tolerance:
+                allowed = max_creep * tolerance
+            if gap < start_gaps[world, point] - allowed:
+                is_contact = int(0)
+                for j in range(counts[world]):
+                    if points[world, j] == point:
+                        is_contact = 1
+                if is_contact == 0:
+                    found += real(1.0)
+                    height = wp.rint(gap / gap_tolerance)
+                    if height < min_height:
+                        min_height = height
+                        first = real(k)
+    point = lowest_of_block(order, min_height, first)
+    found = sum_of_block(found)
+    if lane == 0:
+        lowest_out[world, cell] = point
+        if found > real(0.0):
+            wp.atomic_add(penetrating, world, found)
+
+
+@wp.kernel
+def select_points_kernel(
+    # Model:
+    cell_from_point: wp.array[int],
+    activation_distance: real,
+    hysteresis: real,
+    # In:
+    previous: wp.array2d[int],
+    previous_counts: wp.array[int],
+    loaded: wp.array2d[int],
+    gaps: wp.array2d[real],
+    lowest: wp.array2d[int],
+    # Out:
+    candidates: wp.array2d[int],
+    points_out: wp.array2d[int],
+    counts_out: wp.array[int],
+):
+    """Select the points of a step by the rules of ``ContactSelector``, in ascending order.
+
+    ``previous`` and ``loaded`` are (B, L), ``gaps`` (B, P) at the predicted end, ``lowest`` (B, C) the lowest active
+    point of each cell; ``candidates`` (B, L + C) is a workspace.
+    """
+    world, lane = wp.tid()
+    slots = previous.shape[1]
+    count = slots + lowest.shape[1]
+    for cell in range(lane, lowest.shape[1], wp.block_dim()):
+        candidates[world, slots + cell] = lowest[world, cell]
+    sync_block()
+    for k in range(lane, slots, wp.block_dim()):
+        candidate = int(-1)
+        if k < previous_counts[world]:
+            point = previous[world, k]
+            cell = cell_from_point[point]
+            gap = gaps[world, point]
+            limit = real(wp.inf)
+            if loaded[world, k] == 0 and lowest[world, cell] >= 0:
+                limit = gaps[world, lowest[world, cell]] + hysteresis
+            if gap < real(2.0) * activation_distance and gap <= limit:
+                # The cell adds no further point. All threads that write here write the same.
+                candidates[world, slots + cell] = -1
+                candidate = point
+        candidates[world, k] = candidate
+    sync_block()
+    valid = real(0.0)
+    for i in range(lane, count, wp.block_dim()):
+        point = candidates[world, i]
+        if point >= 0:
+            valid += real(1.0)
+            rank = int(0)
+            for j in range(count):
+                other = candidates[world, j]
+                if other >= 0 and other < point:
+                    rank += 1
+            points_out[world, rank] = point
+    valid = sum_of_block(valid)
+    if lane == 0:
+        counts_out[world] = int(valid)
+
+
+@wp.kernel
+def append_points_kernel(
+    # Model:
+    gap_tolerance: real,
+    # In:
+    lowest: wp.array2d[int],
+    gaps: wp.array2d[real],
+    # In and out:
+    points: wp.array2d[int],
+    counts: wp.array[int],
+):
+    """Append the points in ``lowest`` (B, C) that are not negative to the first ``counts`` of ``points`` (B, K), in
+    ascending order of their ``gaps`` (B, P), rounded to ``gap_tolerance``, and then of their indices.
+    """
+    world, lane = wp.tid()
+    first = counts[world]
+    sync_block()
+    valid = real(0.0)
+    for i in range(lane, lowest.shape[1], wp.block_dim()):
+        point = lowest[world, i]
+        if point >= 0:
+            valid += real(1.0)
+            height = wp.rint(gaps[world, point] / gap_tolerance)
+            rank = int(0)
+            for j in range(lowest.shape[1]):
+                other = lowest[world, j]
+                if other >= 0:
+                    other_height = wp.rint(gaps[world, other] / gap_tolerance)
+                    if other_height < height or (other_height == height and other < point):
+                        rank += 1
+            points[world, first + rank] = point
+    valid = sum_of_block(valid)
+    if lane == 0:
+        counts[world] = first + int(valid)

@@ -18,12 +18,6 @@ CONTACT = [
         "39 bisections end an arm within 2e-12 of its length from the ground, 40 within 1e-12",
     ),
     Survivor(
-        "contact/selection.py",
-        "lowest = self._lowest(gaps < self.activation_distance, gaps)",
-        "lowest = self._lowest(gaps <= self.activation_distance, gaps)",
-        "a gap exactly at the threshold may count either way",
-    ),
-    Survivor(
         "kernels/contact/coulomb.py",
         "sweeps = _FEW_SWEEPS",
         "sweeps = - _FEW_SWEEPS",
@@ -54,13 +48,7 @@ CONTACT = [
         "the bound only avoids a division by zero, but no tetrahedron has all its points at their mean",
     ),
     Survivor(
-        "contact/batch_contacts.py",
-        "points.scatter_(1, torch.where(selected, columns, capacity), torch.where(selected, numbers, 0))",
-        "points.scatter_(1, torch.where(selected, columns, capacity), torch.where(selected, numbers, 1))",
-        "points that are not selected go to an extra column, which is cut off",
-    ),
-    Survivor(
-        "contact/batch_contacts.py",
+        "contact/device_coulomb.py",
         "matrices = start.new_empty((worlds, size, (size + 4) // 4, 4))",
         "matrices = start.new_empty((worlds, size, (size + 4) // 3, 4))",
         "capacity for a few more numbers",
@@ -94,12 +82,6 @@ CONTACT = [
         "column = wp.clamp(wp.floor(u + real(0.5)), real(-2.0), real(columns) + real(2.0))",
         "column = wp.clamp(wp.floor(u + real(0.5)), real(- 1.0), real(columns) + real(2.0))",
         "far outside, the edge value extends without limit, so the clamp changes nothing",
-    ),
-    Survivor(
-        "contact/batch_step.py",
-        "sinking = torch.where(gaps < task.start_gaps - allowed, gaps, 0.0)",
-        "sinking = torch.where(gaps < task.start_gaps - allowed, gaps, 1.0)",
-        "a point that does not sink is added neither with gap 0 nor with 1 m: only deep ones are",
     ),
     Survivor(
         "contact/coulomb.py",

@@ -1,12 +1,67 @@
-"""Kernels for the contacts of many worlds with one mesh: the products W^T, W v and W^T f with the contact Jacobian W
+"""Kernels for the contacts of all worlds: their record, and the products W^T, W v and W^T f with the contact Jacobian W
 (Eq. 8).
 """
 
 import warp as wp
 
+from egs_warp.kernels.contact.gaps import embedded_point
+from egs_warp.kernels.contact.height_field import ground_frame, height_and_slopes
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def contact_record_kernel(
+    # Model:
+    nodes: wp.array[wp.vec4i],
+    weights: wp.array[Vec4],
+    frames: wp.array[Mat33],
+    axes: Mat33,
+    origin: Vec3,
+    spacing: real,
+    coefficients: wp.array2d[real],
+    # In:
+    points: wp.array2d[int],
+    counts: wp.array[int],
+    positions: wp.array2d[Vec3],
+    gaps: wp.array2d[real],
+    faces: wp.array2d[int],
+    # Out:
+    nodes_out: wp.array2d[wp.vec4i],
+    weights_out: wp.array2d[Vec4],
+    axes_out: wp.array2d[Mat33],
+    gaps_out: wp.array2d[real],
+    faces_out: wp.array2d[int],
+):
+    """Write nodes, weights, frame, gap and face of the first ``counts`` of the ``points`` (B, K), and zeros as padding.
+
+    The frame is that of the face in ``frames``, or that of uneven ground below the point if there are ``coefficients``
+    and the face is 0.
+    """
+    world, k = wp.tid()
+    record_nodes = wp.vec4i()
+    record_weights = Vec4()
+    frame = Mat33()
+    gap = real(0.0)
+    face = int(0)
+    if k < counts[world]:
+        point = points[world, k]
+        record_nodes = nodes[point]
+        record_weights = weights[point]
+        gap = gaps[world, point]
+        face = faces[world, point]
+        if face == 0 and coefficients.shape[0] > 0:
+            x = embedded_point(record_nodes, record_weights, positions, world)
+            ground = height_and_slopes(axes, origin, spacing, coefficients, x)
+            frame = ground_frame(axes, ground[1], ground[2])
+        else:
+            frame = frames[face]
+    nodes_out[world, k] = record_nodes
+    weights_out[world, k] = record_weights
+    axes_out[world, k] = frame
+    gaps_out[world, k] = gap
+    faces_out[world, k] = face
 
 
 @wp.kernel

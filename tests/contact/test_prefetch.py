@@ -11,10 +11,9 @@ pytest.importorskip("torch")
 import torch
 import warp as wp
 
-from egs_warp.contact.coupled_step import ACTIVATION_DEPTH, MAX_CREEP, MAX_SINK
 from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
-from egs_warp.contact.device_selection import DeviceContactSelector
-from egs_warp.contact.selection import ContactSelector
+from egs_warp.contact.prefetch import ContactPrefetch
+from egs_warp.contact.selection import ACTIVATION_DEPTH, MAX_CREEP, MAX_SINK, ContactSelector
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.cuda_graphs import GraphStream
 from egs_warp.geometry.plane import Plane
@@ -53,13 +52,17 @@ def test_selected_points_equal_those_of_the_host(kind: str, device: str) -> None
     points, some of which are loaded. Penetrating points are counted unless they are in contact."""
     geometry = ground(kind)
     nodes, random = geometry.mesh.nodes, np.random.default_rng(0)
-    detector, points = (
-        ContactDetector(geometry, device=device),
-        ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3),
-    )
-    sight = DeviceContactSelector(detector, points, GraphStream(torch.device(device)), TOLERANCE)
+    detector = ContactDetector(geometry, device=device)
+    points = ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3, device=device)
+    sight = ContactPrefetch(detector, points, GraphStream(torch.device(device)), TOLERANCE)
     start, ends = (wp.zeros(len(nodes), dtype=Vec3, device=device) for _ in range(2))
     before, changed, sunk = np.zeros(0, int), 0, 0
+
+    def wait() -> None:
+        # The workspaces synchronise with their graph; here nothing else has synchronised with the download.
+        if torch.device(device).type == "cuda":
+            torch.cuda.synchronize()
+
     for lean, lift in ((0.0, 0.004), (0.0, 0.0), (0.03, -0.003), (-0.02, -0.004), (0.0, 0.05), (0.01, 0.0)):
         at = nodes + [lean, 0.0, lift] + 0.002 * random.standard_normal(nodes.shape)
         then = at + np.column_stack([np.zeros((len(nodes), 2)), lean * nodes[:, 0] - 0.002])
@@ -68,43 +71,34 @@ def test_selected_points_equal_those_of_the_host(kind: str, device: str) -> None
         loaded = random.random(len(before)) < 0.5
         gaps, _ = detector.gaps(then)
         here = detector.contact_set(points.select(before, loaded, gaps), at)
-        sight.start_prefetch(start, ends, before)
-        there = sight.select(before, loaded, at)
+        sight.start(start, ends, before, loaded)
+        wait()
+        there = sight.contacts(len(before))
         assert_alike(there, here)
         changed += len(before) > 0 and here.count > 0 and not np.array_equal(before, here.points)
         taken = there.points[::2]
         seen, least = torch.zeros((2, 1), dtype=torch.float64, device=device)
-        told = torch.as_tensor(taken.astype(np.int32), device=device)
-        sight.enqueue_penetration(ends, told, torch.tensor([len(taken)], dtype=torch.int32, device=device), seen)
+        places = torch.as_tensor(np.append(taken, [0] * 5).astype(np.int32), device=device)
+        count = torch.tensor([len(taken)], dtype=torch.int32, device=device)
+        sight.enqueue_penetration(ends, places, count, seen)
         allowed = np.where(gaps < -TOLERANCE, MAX_CREEP, MAX_SINK) * TOLERANCE
         sinks = (gaps < -ACTIVATION_DEPTH * TOLERANCE) & (gaps < detector.gaps(at)[0] - allowed)
         sinks[taken] = False
         sight.enqueue_min_gap(least[0])
         assert seen.item() == sinks.sum() and least.item() == pytest.approx(gaps.min(), abs=1e-12)
         sunk += sinks.any()
-        before_it, joining = (
-            detector.gaps(at),
-            points.find_deeper(taken, np.where(sinks, gaps, 0.0), ACTIVATION_DEPTH * TOLERANCE),
-        )
+        joining = points.find_penetrating(taken, gaps, detector.gaps(at)[0], TOLERANCE)
         # The next step starts from the end of this one.
         after = then + 0.002 * random.standard_normal(nodes.shape)
         next_ends = wp.array(after, dtype=Vec3, device=device)
-        places = torch.as_tensor(np.append(taken, [0] * 5).astype(np.int32), device=device)
-        sight.enqueue_prefetch(next_ends, places)
-        sight.advance_prefetch()
-        if torch.device(device).type == "cuda":
-            # The workspaces synchronise with their graph; here nothing else has synchronised with the download.
-            torch.cuda.synchronize()
-        found = sight.deepest(len(places))
-        found = found[points.order_by_gap(found[:, 0], found[:, 1])]
-        assert np.array_equal(found[:, 0], joining)
-        np.testing.assert_allclose(found[:, 1], gaps[joining], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(found[:, 2], before_it[0][joining], rtol=0, atol=1e-12)
-        assert np.array_equal(found[:, 3], before_it[1][joining])
-        loaded = random.random(len(taken)) < 0.5
-        expected = points.select(taken, loaded, detector.gaps(after)[0])
-        assert_alike(sight.select(taken, loaded, then, capacity=len(places)), detector.contact_set(expected, then))
-        sight.enqueue_penetration(next_ends, told, torch.tensor([len(taken)], dtype=torch.int32, device=device), seen)
+        loads = torch.as_tensor(np.append(random.normal(size=len(taken)), [1.0] * 5), device=device)
+        sight.enqueue_next((start, ends), next_ends, places, count, loads)
+        sight.advance()
+        wait()
+        assert_alike(sight.deepest(len(places)), detector.contact_set(joining, at))
+        expected = points.select(taken, loads.cpu().numpy()[: len(taken)] > 0.0, detector.gaps(after)[0])
+        assert_alike(sight.contacts(len(places)), detector.contact_set(expected, then))
+        sight.enqueue_penetration(next_ends, places, count, seen)
         later = detector.gaps(after)[0]
         allowed = np.where(later < -TOLERANCE, MAX_CREEP, MAX_SINK) * TOLERANCE
         sinks = (later < -ACTIVATION_DEPTH * TOLERANCE) & (later < gaps - allowed)
