@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from egs_warp.deformation.deformer import MAX_STRETCH
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.geometry.body_frame import BodyFrame, upright_frame
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -94,6 +95,7 @@ def _run_of_one_frame(splats: GaussianCloud, bounds: np.ndarray, *, title: str) 
             "fov": _FOV_DEGREES,
         },
         "degree": {"splats": splats.sh_degree, "scene": 0},
+        "max_stretch": MAX_STRETCH,
     }
     no_indices = np.zeros(0, np.int32)
     arrays = {
