@@ -90,6 +90,7 @@ def _read(data: bytes) -> tuple[BundleFile | None, list[str]]:
     payload = memoryview(data)[HEAD.size + length :]
     if len(payload) != text["bytes"]:
         problems.append(f"the data have {len(payload)} bytes, but the JSON text states {text['bytes']}")
+    problems += _order_problems(text)
     end = 0
     stored: dict[str, PackedArray] = {}
     # In the order of the file, in which a player receives them.
@@ -144,6 +145,17 @@ def _entries(text: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
             yield from ((f"bodies/{number}/blocks/{k}/{name}", entry) for name, entry in block["arrays"].items())
 
 
+def _order_problems(text: dict[str, Any]) -> Iterator[str]:
+    """Yield a line if a player would not receive the arrays in the order in which it needs them."""
+    bodies = text["bodies"]
+    groups = [body["arrays"] for body in bodies]
+    for k in range(max(len(body.get("blocks", ())) for body in bodies)):
+        groups += [body["blocks"][k]["arrays"] for body in bodies if len(body.get("blocks", ())) > k]
+    offsets = [[entry["offset"] for entry in group.values()] for group in groups]
+    if any(max(before) >= min(after) for before, after in zip(offsets, offsets[1:], strict=False)):
+        yield "the arrays are not in order: those of all bodies, then the first blocks of all bodies, and so on"
+
+
 def _number_problems(place: str, entry: dict[str, Any], array: PackedArray) -> Iterator[str]:
     """Yield what is wrong with the numbers of one array."""
     if array.lower is None or array.step is None or array.error is None:
@@ -185,11 +197,9 @@ def _body_problems(
     yield from (f"{name} has shape {list(arrays[name].stored.shape)}, not {list(expected[name])}" for name in wrong)
     if "bands" in expected and not wrong:
         bands = arrays["bands"]
-        if (
-            bands.step is None
-            or bands.lower is None
-            or not np.allclose(bands.lower, -BAND_ZERO * bands.step, rtol=1e-6)
-        ):
+        if bands.stored.dtype != np.uint8 or bands.step is None or bands.lower is None:
+            yield "bands are not uint8 with a step"
+        elif not np.allclose(bands.lower, -BAND_ZERO * bands.step, rtol=1e-6):
             yield f"lower of bands is not {-BAND_ZERO} steps"
     if wrong or "blocks" not in body:
         return

@@ -83,7 +83,12 @@ def _double(entry: dict[str, Any]) -> None:
         (lambda t: _double(_arrays(t)["means"]), "bodies/0/means: the error "),
         (lambda t: _arrays(t)["tets"].update(lower=[0], step=[1], error=0), "bodies/0/tets: it holds whole numbers"),
         (lambda t: _arrays(t)["tets"].update(offset=0), "bodies/0/tets: its bytes overlap"),
+        (
+            lambda t: [_arrays(t)["bands"].pop(k) for k in ("lower", "step", "error")],
+            "bodies/0: bands are not uint8 with",
+        ),
         (lambda t: _arrays(t)["bands"].update(lower=[0] * 3), "bodies/0: lower of bands is not -128 steps"),
+        (lambda t: t["bodies"].reverse(), "the arrays are not in order: those of all bodies, then the first blocks"),
         (lambda t: t["bodies"][1].update(count=6), "bodies/1: means has shape [7, 3], not [6, 3]"),
         (lambda t: _block(t).update(first=59), "bodies/0: blocks/1: begins at frame 59, not 60"),
         (lambda t: t.update(frames=131), "bodies/0: its blocks have 130 frames, but the bundle has 131"),
