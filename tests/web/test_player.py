@@ -225,7 +225,6 @@ def test_play_ends_and_loop_does_not(chromium: Any, site: str, folder: Path) -> 
         """() => {
             window.times = [];
             const one = document.querySelector("egs-player");
-            one.loop = true;
             one.setAttribute("loop", "");
             one.addEventListener("timeupdate", () => times.push(one.currentTime));
             one.play();

@@ -231,7 +231,7 @@ export class EgsPlayer extends HTMLElement {
     this.loads++;
     this.isLoading = false;
     cancelAnimationFrame(this.request);
-    this.stage?.dispose();
+    void this.stage?.dispose();
     this.frame.replaceChildren();
     this.stage = undefined;
     this.bundle = undefined;

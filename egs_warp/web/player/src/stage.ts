@@ -15,6 +15,10 @@ const DIRECTION = new THREE.Vector3(-0.5, 1, -0.25).normalize();
 const FOV = 30;
 const DISTANCE = 4;
 
+function pause(milliseconds: number): Promise<void> {
+  return new Promise((resolve) => setTimeout(resolve, milliseconds));
+}
+
 export class Stage {
   readonly canvas: HTMLCanvasElement;
   readonly creature: Creature;
@@ -31,6 +35,7 @@ export class Stage {
   private floorHides = false;
   private fov = FOV;
   private dirty = true;
+  private isDisposed = false;
 
   constructor(bundle: Bundle) {
     const { facts, bodies } = bundle;
@@ -136,12 +141,13 @@ export class Stage {
   /** Draw after the splats are sorted for the current view. */
   async drawSorted(): Promise<void> {
     const { spark } = this.splatRenderer;
-    for (let round = 0; round < 2; round++) {
+    for (let round = 0; round < 2 && !this.isDisposed; round++) {
       this.camera.updateMatrixWorld();
       this.render();
       await spark.update({ scene: this.scene, camera: this.camera });
-      while (spark.sorting) await new Promise((resolve) => setTimeout(resolve, 5));
+      while (spark.sorting) await pause(5);
     }
+    if (this.isDisposed) return;
     this.render();
     this.dirty = false;
   }
@@ -152,9 +158,13 @@ export class Stage {
     this.renderer.render(this.scene, this.camera);
   }
 
-  dispose(): void {
+  /** Release the WebGL context, after the sort in progress: Spark cannot read from a lost context. */
+  async dispose(): Promise<void> {
+    const { spark } = this.splatRenderer;
+    this.isDisposed = true;
     this.controls.dispose();
-    this.splatRenderer.spark.dispose();
+    while (spark.sorting || spark.sortDirty) await pause(10);
+    spark.dispose();
     this.renderer.dispose();
     this.renderer.forceContextLoss();
   }
