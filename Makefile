@@ -97,17 +97,24 @@ DEVICE ?= cuda:0
 paper: setup
 	$(BIN)/python benchmarks/paper.py $(if $(QUICK),--quick --device cpu,--device $(DEVICE)) $(if $(KEEP),--keep)
 
-# The page of egs-warp view, from its TypeScript sources; needs node 20 or newer. The wheel and the sdist hold it built.
+# The page of egs-warp view and the player of bundles, from their TypeScript sources; needs node 20 or newer. The wheel and
+# the sdist hold both built.
 PAGE := egs_warp/web/client
-web: egs_warp/web/page.html
+PLAYER := egs_warp/web/player
+web: egs_warp/web/page.html $(PLAYER)/dist/egs-player.js
 
 egs_warp/web/page.html: $(PAGE)/package-lock.json $(PAGE)/build.mjs $(PAGE)/tsconfig.json $(wildcard $(PAGE)/src/*) egs_warp/render/studio.json
 	@command -v npm > /dev/null || { echo "make web: npm is missing; install node 20 or newer"; exit 1; }
 	cd $(PAGE) && npm ci --no-audit --no-fund --loglevel=error && npm run --silent build
 
-# Wheel and sdist into out/dist, both tried in an empty environment outside of the tree.
+$(PLAYER)/dist/egs-player.js: $(PLAYER)/package-lock.json $(PLAYER)/build.mjs $(PLAYER)/tsconfig.json $(wildcard $(PLAYER)/src/* $(PAGE)/src/*) egs_warp/render/studio.json
+	@command -v npm > /dev/null || { echo "make web: npm is missing; install node 20 or newer"; exit 1; }
+	cd $(PLAYER) && npm ci --no-audit --no-fund --loglevel=error && npm run --silent build
+
+# Wheel and sdist into out/dist, both tried in an empty environment outside of the tree, and the npm package of the player.
 build: setup web
 	VENV=$(VENV) .ci/package
+	cd $(PLAYER) && npm pack --silent --pack-destination ../../../out/dist
 
 # Beside them a bill of materials and requirements with hashes; ALSO="win_amd64:3.12 ..." adds those of other platforms.
 release: build

@@ -13,7 +13,7 @@ from pathlib import Path
 import bpy  # pyright: ignore[reportMissingImports]
 import numpy as np
 
-BUNDLE = os.environ.get("BUNDLE", "jump.npz")
+BUNDLE = os.environ.get("BUNDLE", "jump.egs")
 SIGMAS = 1.3
 """Size of an ellipsoid in standard deviations: a solid ellipsoid of this size looks like a splat, which fades out."""
 MIN_OPACITY = 0.3
@@ -23,14 +23,14 @@ sys.path.append(str(Path(bpy.context.space_data.text.filepath if bpy.context.spa
 from read_bundle import Bundle  # noqa: E402
 
 bundle = Bundle(BUNDLE)
-visible = np.flatnonzero(1 / (1 + np.exp(-bundle.arrays["opacity_logits"])) > MIN_OPACITY)
+visible = np.flatnonzero(bundle.arrays["opacities"] > MIN_OPACITY)
 mesh = bpy.data.meshes.new("splats")
 mesh.from_pydata(bundle.arrays["means"][visible].tolist(), [], [])
 splats = bpy.data.objects.new("splats", mesh)
 bpy.context.scene.collection.objects.link(splats)
 for name, kind in (("turn", "QUATERNION"), ("size", "FLOAT_VECTOR"), ("colour", "FLOAT_COLOR")):
     mesh.attributes.new(name, kind, "POINT")
-srgb = np.clip(0.5 + 0.28209479 * bundle.arrays["sh"][visible, 0], 0, 1)
+srgb = np.clip(bundle.arrays["colours"][visible], 0, 1)
 linear = np.where(srgb < 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 mesh.attributes["colour"].data.foreach_set("color", np.c_[linear, np.ones(len(visible))].astype(np.float32).ravel())
 
@@ -38,8 +38,8 @@ mesh.attributes["colour"].data.foreach_set("color", np.c_[linear, np.ones(len(vi
 def show(scene: bpy.types.Scene, _: object = None) -> None:
     """Show the frame of the bundle at the time of ``scene``."""
     seconds = (scene.frame_current - scene.frame_start) * scene.render.fps_base / scene.render.fps
-    index = round(seconds * float(bundle.arrays["fps"]))
-    means, covariances, _ = bundle.frame(min(max(index, 0), len(bundle.arrays["nodes"]) - 1))
+    index = round(seconds * bundle.text["rate"])
+    means, covariances, _ = bundle.frame(min(max(index, 0), len(bundle.nodes) - 1))
     squares, axes = np.linalg.eigh(covariances[visible])
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]
     mesh.attributes["position"].data.foreach_set("vector", means[visible].astype(np.float32).ravel())
@@ -91,7 +91,7 @@ def _material() -> bpy.types.Material:
 
 splats.modifiers.new("ellipsoids", "NODES").node_group = _ellipsoids()
 scene = bpy.context.scene
-scene.render.fps = round(float(bundle.arrays["fps"]))
-scene.frame_start, scene.frame_end = 0, len(bundle.arrays["nodes"]) - 1
+scene.render.fps = round(bundle.text["rate"])
+scene.frame_start, scene.frame_end = 0, len(bundle.nodes) - 1
 bpy.app.handlers.frame_change_pre.append(show)
 scene.frame_set(0)

@@ -1,60 +1,77 @@
-"""Read the file that ``egs-warp export RUN --to bundle`` writes; needs only numpy (docs/guide/export.md)."""
+"""Read the file that ``egs-warp export RUN --to bundle`` writes; needs only numpy (docs/concepts/bundle.md)."""
 
+import json
 import sys
+import zlib
 
 import numpy as np
 
 
 class Bundle:
-    """Splats at rest, their cage, and the positions of its nodes in each frame; metres, z up."""
+    """A body of a bundle: splats at rest, their cage, and the positions (F, N, 3) of its nodes in each frame."""
 
-    def __init__(self, path: str) -> None:
-        with np.load(path, allow_pickle=False) as data:
-            self.arrays = dict(data)
-        w, xyz = np.split(self.arrays["rotations"].astype(float)[:, None], [1], axis=2)
-        cross = np.cross(xyz, np.eye(3)).transpose(0, 2, 1)
-        self.axes = np.eye(3) + 2 * (w * cross + cross @ cross)  # (n, 3, 3), columns are the axes of each splat
-        self.corners = self.arrays["rest_nodes"][self.arrays["tets"]].astype(float)
-        self.inverse = np.linalg.inv((self.corners[:, 1:] - self.corners[:, :1]).transpose(0, 2, 1))
+    def __init__(self, path: str, body: int = 0) -> None:
+        with open(path, "rb") as file:
+            assert file.read(8) == b"EGSB\1\0\0\0", f"{path}: not a bundle of version 1"
+            self.text = json.loads(file.read(int.from_bytes(file.read(4), "little")))
+            self._data = file.read()
+        self.body = self.text["bodies"][body]
+        self.arrays = a = {name: self._numbers(entry) for name, entry in self.body["arrays"].items()}
+        blocks = [{k: self._numbers(entry) for k, entry in block["arrays"].items()} for block in self.body["blocks"]]
+        self.nodes = np.concatenate([block["origins"][:, None] + block["nodes"] for block in blocks])
+        angles, v = np.linalg.norm(a["rotations"], axis=1)[:, None, None] / np.pi, a["rotations"][:, None]
+        once, twice = np.cross(v, np.eye(3)), np.cross(v, np.cross(v, np.eye(3)))
+        # (n, 3, 3): rows are the axes of each splat.
+        self.axes = np.eye(3) + np.sinc(angles) * once + 0.5 * np.sinc(0.5 * angles) ** 2 * twice
+        self.corners = a["rest_nodes"][a["cage_tets"]].astype(float)
+
+    def _numbers(self, entry: dict) -> np.ndarray:
+        planes = zlib.decompress(self._data[entry["offset"] :][: entry["bytes"]])
+        items = np.frombuffer(planes, np.uint8).reshape(-1, max(entry["shape"][0], 1)).T.copy()
+        stored = items.view(entry["type"]).reshape(entry["shape"])
+        stored = np.cumsum(stored, axis=0, dtype=stored.dtype) if entry.get("delta") else stored
+        return np.array(entry["lower"]) + np.array(entry["step"]) * stored if "step" in entry else stored
 
     def frame(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return means (n, 3), covariances and rotations (n, 3, 3); colour along d is ``sh`` along rotation^T d."""
-        a, tet, rows = self.arrays, self.arrays["mean_tets"], self.arrays["arm_rows"]
-        moved = a["nodes"][index][a["tets"]].astype(float)
-        gradients = (moved[:, 1:] - moved[:, :1]).transpose(0, 2, 1) @ self.inverse
-        turns = _rotations(gradients)[tet]
-        carriers = np.where(a["rigid"][:, None, None], turns, gradients[tet])  # rigid: far outside the cage
-        means = moved[tet, 0] + _apply(carriers, a["means"] - self.corners[tet, 0])
-        stretched = carriers @ self.axes
-        through, sides = stretched[rows], np.zeros((2, len(rows), 3, 3))  # each axis end in its own tetrahedron
-        for k, (end, share) in enumerate(zip(a["arm_tets"], a["arm_shares"][:, :, None], strict=True)):
-            sign = 1.0 if k < 3 else -1.0
-            inner, outer = sign * through[:, :, k % 3], sign * _apply(gradients[end], self.axes[rows, :, k % 3])
-            image = moved[end, 0] + _apply(gradients[end], a["means"][rows] - self.corners[end, 0])
-            bridged = outer + (image - means[rows]) / np.where(share < 0, -share, 1.0)
-            limit = a["max_stretch"] * np.maximum(np.linalg.norm(inner, axis=1), np.linalg.norm(outer, axis=1))
-            bridged *= np.minimum(1.0, limit / np.maximum(np.linalg.norm(bridged, axis=1), 1e-30))[:, None]
-            arm = np.where(share < 0, bridged, share * inner + (1.0 - share) * outer)
-            sides[k // 3, :, :, k % 3] = sign * np.where((end == tet[rows])[:, None], inner, arm)
-        average = sides.mean(axis=0)
-        upright = np.linalg.det(average) > 0
-        stretched[rows[upright]] = average[upright]
-        turns[rows[upright]] = _rotations(average[upright]) @ self.axes[rows[upright]].transpose(0, 2, 1)
-        means[rows] += np.einsum("kn,nik->ni", a["arm_bulges"], sides[0] - sides[1])
-        factors = stretched * np.exp(a["log_scales"])[:, None, :]
-        return means, factors @ factors.transpose(0, 2, 1), turns
+        """Return means (n, 3), covariances and rotations R (n, 3, 3); colour along d is that of ``bands`` along d @ R.
+
+        A tetrahedron maps a row vector v to v @ map.
+        """
+        a, tet, rows = self.arrays, self.arrays["tets"], np.flatnonzero(self.arrays["carriers"] == 1)
+        moved = self.nodes[index][a["cage_tets"]]
+        maps = np.linalg.inv(self.corners[:, 1:] - self.corners[:, :1]) @ (moved[:, 1:] - moved[:, :1])
+        turns, deviations = _rotations(maps)[tet], np.exp(a["log_scales"])
+        own = np.where(a["carriers"][:, None, None] == 2, turns, maps[tet])
+        means = moved[tet, 0] + _apply(a["means"] - self.corners[tet, 0], own)
+        axes, signs = self.axes @ own, np.repeat([1.0, -1.0], 3)[:, None]
+        end = a["arm_tets"] + tet[rows, None].astype(a["arm_tets"].dtype)  # (r, 6): the ends + + + - - - of the axes
+        inner = signs * np.tile(axes[rows], (1, 2, 1))
+        outer = signs * _apply(np.tile(self.axes[rows], (1, 2, 1)), maps[end])
+        image = moved[end, 0] + _apply(a["means"][rows, None] - self.corners[end, 0], maps[end])
+        length, share = a["arm_lengths"] * np.tile(deviations[rows], 2), a["arm_shares"][:, :, None]
+        bridge = outer + (image - means[rows, None]) / np.where(length > 0, length, 1.0)[:, :, None]
+        limit = self.body["max_stretch"] * np.maximum(*(np.linalg.norm(arm, axis=2) for arm in (inner, outer)))
+        bridge *= np.minimum(1.0, limit / np.maximum(np.linalg.norm(bridge, axis=2), 1e-30))[:, :, None]
+        arm = np.where(length[:, :, None] > 0, bridge, share * inner + (1.0 - share) * outer)
+        plus, minus = np.split(signs * np.where((end == tet[rows, None])[:, :, None], inner, arm), 2, axis=1)
+        means[rows] += _apply(a["arm_bulges"] * deviations[rows], plus - minus)
+        upright = np.linalg.det(plus + minus) > 0
+        axes[rows[upright]] = 0.5 * (plus + minus)[upright]
+        turns[rows[upright]] = np.linalg.inv(self.axes[rows[upright]]) @ _rotations(axes[rows[upright]])
+        factors = deviations[:, :, None] * axes
+        return means, np.einsum("nki,nkj->nij", factors, factors), turns.swapaxes(1, 2)
 
 
-def _apply(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    return np.einsum("nij,nj->ni", matrices, vectors)
+def _apply(vectors: np.ndarray, maps: np.ndarray) -> np.ndarray:
+    return np.einsum("...j,...ji->...i", vectors, maps)
 
 
-def _rotations(matrices: np.ndarray) -> np.ndarray:
-    left, _, right = np.linalg.svd(matrices)
+def _rotations(maps: np.ndarray) -> np.ndarray:
+    left, _, right = np.linalg.svd(maps)
     left[..., -1] *= np.linalg.det(left @ right)[..., None]
     return left @ right
 
 
 if __name__ == "__main__":
-    arrays = Bundle(sys.argv[1]).arrays
-    print(f"{len(arrays['means'])} splats, {len(arrays['nodes'])} frames at {float(arrays['fps']):g} a second")
+    found = Bundle(sys.argv[1])
+    print(f"{len(found.arrays['means'])} splats, {len(found.nodes)} frames at {found.text['rate']:g} a second")

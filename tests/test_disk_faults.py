@@ -42,7 +42,7 @@ COMMANDS = {
     "glTF": "export {run} --to glb --frame 4 --out {out}",
     "usd": "export {run} --to usd --out {out}/a.usdc",
     "usd as text": "export {run} --to usd --out {out}/a.usda",
-    "bundle": "export {run} --to bundle --out {out}/a.npz",
+    "bundle": "export {run} --to bundle --out {out}/a.egs",
     "animate": "animate {capture} --up z --frames 3 --size 64 --out {out}",
     "plane": "plane {scene}/scene.ply --object {scene}/photo1.png --cameras {scene}/cameras.json --out {out}",
     "segment": "segment {scene}/scene.ply --object {scene}/photo1.png --cameras {scene}/cameras.json"

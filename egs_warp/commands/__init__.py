@@ -8,7 +8,7 @@ GROUPS = {
     "captures": ("pose", "train", "convert"),
     "scenes": ("pick", "plane", "segment", "inpaint"),
     "motion": ("info", "muscles", "animate", "resume", "live"),
-    "finished runs": ("render", "view", "export"),
+    "finished runs": ("render", "view", "export", "validate"),
 }
 """Command names by group, in the order of ``egs-warp --help``."""
 

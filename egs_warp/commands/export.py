@@ -11,7 +11,7 @@ from egs_warp.errors import UserError
 EXAMPLES = (
     "out/jump --to ply --out frames --every 2",
     "out/jump --to usd --out jump.usdc",
-    "out/jump --to bundle --out jump.npz",
+    "out/jump --to bundle --out jump.egs",
     "out/jump --to glb --out still.glb --frame 40",
 )
 _WITHOUT_ANTIALIASING = ("splat", "usd")
@@ -26,13 +26,13 @@ def add_parser(commands: Commands) -> None:
         "--to",
         required=True,
         choices=(*SPLAT_FILES, "usd", "bundle"),
-        help="output format: numbered splat files, one USD stage (usd), or one .npz file (bundle)",
+        help="output format: numbered splat files, one USD stage (usd), or one .egs file (bundle)",
     )
     export.add_argument(
         "--out",
         required=True,
         type=named_path,
-        help="folder for numbered files, or a file for a single --frame; a .usdc or .usda file for usd; an .npz file "
+        help="folder for numbered files, or a file for a single --frame; a .usdc or .usda file for usd; an .egs file "
         "for bundle",
     )
     export.add_argument("--every", type=int, default=1, metavar="N", help="write every N-th frame of the 60 Hz run (1)")
@@ -42,6 +42,7 @@ def add_parser(commands: Commands) -> None:
     export.add_argument(
         "--degree", type=int, choices=(0, 1, 2, 3), help="highest degree of spherical harmonics to write (all)"
     )
+    export.add_argument("--licence", default="", metavar="TEXT", help="licence of the capture, which a bundle states")
     export.set_defaults(run=_export)
 
 
@@ -55,13 +56,15 @@ def _export(args: argparse.Namespace) -> int:
     if args.to in ("usd", "bundle") and args.frame is not None:
         format_name = "USD stage" if args.to == "usd" else "bundle"
         raise UserError(f"--frame: a {format_name} contains all frames; leave --frame out, or give --every")
+    if args.licence and args.to != "bundle":
+        raise UserError("--licence: only a bundle states a licence; leave --licence out")
     use_device("cpu")
     run = FinishedRun.read(args.folder)
     if args.to == "usd":
         export_usd(run, args.out, every=args.every, degree=args.degree)
         paths = [args.out]
     elif args.to == "bundle":
-        export_bundle(run, args.out, every=args.every, degree=args.degree)
+        export_bundle(run, args.out, every=args.every, degree=args.degree, licence=args.licence)
         paths = [args.out]
     else:
         paths = export_splats(run, args.out, args.to, frame=args.frame, every=args.every, degree=args.degree)

@@ -1,68 +1,99 @@
-"""Export of a finished run to one file: rest splats, cage and node positions. ``examples/read_bundle.py`` reads it."""
+"""Export of a finished run to a bundle: rest splats, cage and node positions (docs/concepts/bundle.md).
+
+``examples/read_bundle.py`` reads it.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from egs_warp.deformation.deformer import MAX_STRETCH
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import with_degree
-from egs_warp.io.atomic import atomic_write
+from egs_warp.io.bundle import Bundle, BundleBody, BundleCage, write_bundle
+from egs_warp.io.bundle_file import Carrier
 from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.kernels.deformation.cage_maps import RIGID
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.pipelines.export import chosen_frames
 from egs_warp.pipelines.finished_run import FinishedRun
 
-ENDING = ".npz"
-_SCHEMA = 1
+ENDING = ".egs"
 
 
-def export_bundle(run: FinishedRun, path: Path, *, every: int = 1, degree: int | None = None) -> None:
-    """Write ``run`` to one .npz file (docs/guide/export.md).
+def export_bundle(
+    run: FinishedRun, path: Path, *, every: int = 1, degree: int | None = None, licence: str = ""
+) -> None:
+    """Write ``run`` to a bundle (docs/guide/export.md).
 
     Args:
         run: The run to export.
-        path: Name that ends in .npz.
+        path: Name that ends in .egs.
         every: Export each ``every``-th frame at 60 Hz.
         degree: SH degree of the colours; None keeps that of the capture.
+        licence: Licence of the content, as the file will state it.
 
     Raises:
         UserError: ``path`` has another ending, or is a file of a run.
     """
+    check_no_file_of_a_run(path)
     if path.suffix.lower() != ENDING:
         raise UserError(f"{path}: give a name that ends in {ENDING}")
-    check_no_file_of_a_run(path)
+    write_bundle(path, bundle_of(run, every=every, degree=degree, licence=licence))
+
+
+def bundle_of(run: FinishedRun, *, every: int = 1, degree: int | None = None, licence: str = "") -> Bundle:
+    """Return the bundle of ``run``: its creature, and its scene as a static body. The arguments are those of
+    ``export_bundle``."""
     frames = chosen_frames(run, frame=None, every=every)
-    t, splats, plan = run.trajectory, with_degree(run.creature.splats, degree), run.deformer().plan
+    t, camera = run.trajectory, run.creature.camera
+    cage = _cage(run, t.positions[run.steps[frames]])
+    bodies = [BundleBody("creature", with_degree(run.creature.splats, degree), cage)]
+    if run.scene is not None:
+        bodies.append(BundleBody("scene", with_degree(run.scene, degree)))
+    facts = {
+        "title": run.title,
+        "licence": licence,
+        "up": [0.0, 0.0, 1.0],
+        "metres_per_unit": 1.0,
+        "height": t.height,
+        "front": t.front.tolist(),
+        "flat_ground": len(t.planes) == 1 and t.ground_coefficients.size == 0,
+        "camera": {
+            "position": camera.centre.tolist(),
+            "forward": camera.rotation[2].tolist(),
+            "fov": float(np.degrees(2.0 * np.arctan(0.5 * camera.height / camera.fy))),
+        },
+        "capture": {
+            "axes": t.body_axes.tolist(),
+            "origin": t.body_origin.tolist(),
+            "metres_per_unit": t.metres_per_unit,
+        },
+    }
+    return Bundle(tuple(bodies), FRAME_RATE / every, len(frames), facts)
+
+
+def _cage(run: FinishedRun, nodes: np.ndarray) -> BundleCage:
+    """Return the cage of ``run`` with the positions ``nodes`` (F, N, 3)."""
+    splats, plan = run.creature.splats, run.deformer().plan
     codes, shares = plan.mean_tets.numpy(), plan.inside_fractions.numpy()
     rigid = (codes < 0) & (shares[0] == float(RIGID))
-    rows = np.flatnonzero((codes < 0) & ~rigid)
-    arrays: dict[str, Any] = {
-        "schema": np.int32(_SCHEMA),
-        "fps": np.float64(FRAME_RATE / every),
-        "means": splats.means.numpy(),
-        "rotations": splats.rotations.numpy(),
-        "log_scales": splats.log_scales.numpy(),
-        "opacity_logits": splats.opacity_logits.numpy(),
-        "sh": splats.sh.numpy(),
-        "antialiased": np.bool_(splats.antialiased),
-        "rest_nodes": t.rest_positions,
-        "tets": t.tets.astype(np.int32),
-        "nodes": t.positions[run.steps[frames]].astype(np.float32),
-        "mean_tets": np.where(codes < 0, -1 - codes, codes),
-        "rigid": rigid,
-        "arm_rows": rows.astype(np.int32),
-        "arm_tets": plan.end_tets.numpy()[:, rows],
-        "arm_shares": shares[:, rows],
-        "arm_bulges": plan.smoothing_lengths.numpy()[:, rows],
-        "max_stretch": np.float64(MAX_STRETCH),
-        "body_axes": t.body_axes,
-        "body_origin": t.body_origin,
-        "metres_per_unit": np.float64(t.metres_per_unit),
-    }
-    with atomic_write(path) as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)
+    carriers = np.where(rigid, Carrier.RIGID, np.where(codes < 0, Carrier.ARMS, Carrier.TET)).astype(np.uint8)
+    rows = np.flatnonzero(carriers == Carrier.ARMS)
+    deviations = np.exp(splats.log_scales.numpy()[rows].astype(np.float64))
+    arms = shares[:, rows].T
+    return BundleCage(
+        rest_nodes=run.trajectory.rest_positions.astype(np.float32),
+        cage_tets=run.trajectory.tets,
+        surface=run.mesh.boundary_faces(),
+        tets=np.where(codes < 0, -1 - codes, codes),
+        carriers=carriers,
+        arm_tets=plan.end_tets.numpy()[:, rows].T,
+        arm_shares=np.clip(arms, 0.0, 1.0),
+        arm_lengths=np.maximum(-arms, 0.0) / np.tile(deviations, 2),
+        arm_bulges=plan.smoothing_lengths.numpy()[:, rows].T / deviations,
+        max_stretch=MAX_STRETCH,
+        nodes=nodes,
+    )

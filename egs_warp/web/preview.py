@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from egs_warp.deformation.deformer import MAX_STRETCH
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.geometry.body_frame import BodyFrame, upright_frame
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -112,6 +113,7 @@ def still_run(splats: GaussianCloud, bounds: np.ndarray, facts: Mapping[str, Any
         "fibres": [],
         "antialiased": splats.antialiased,
         "degree": {"splats": splats.sh_degree, "scene": 0},
+        "max_stretch": MAX_STRETCH,
         **facts,
     }
     no_indices = np.zeros(0, np.int32)

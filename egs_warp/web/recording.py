@@ -112,6 +112,7 @@ def creature_header(
         },
         "degree": {"splats": render_data.splats.sh_degree, "scene": scene.sh_degree if scene else 0},
         "antialiased": render_data.splats.antialiased,
+        "max_stretch": deformer.max_stretch,
     }
     arrays = {
         "rest": mesh.nodes.astype(np.float32),

@@ -31,6 +31,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import concatenate
 from egs_warp.io import read_cameras, read_capture
+from egs_warp.io.bundle import read_bundle
 from egs_warp.io.cameras import PosedImage, read_points
 from egs_warp.io.glb import write_glb
 from egs_warp.io.limits import MAX_COORDINATE, MAX_SIDE
@@ -51,6 +52,7 @@ from egs_warp.training.checkpoint import Checkpoint
 from egs_warp.version import __version__
 from egs_warp.web.messages import read_message
 from tests.support import onnx
+from tests.support.bundles import bundle_bytes, text_of, with_text
 from tests.support.captures import ARRAYS, good_bytes, small_cloud, spz_of_streams
 from tests.support.finished_runs import arrays_as_json, draw_run, finished_run, npz_of_json
 from tests.support.meshes import block_mesh
@@ -154,6 +156,14 @@ def _capture(path: Path) -> None:
     assert (np.abs(values["means"]) <= 2e4 * MAX_COORDINATE).all() and (np.abs(values["sh"]) <= 1e3).all()
     assert values["log_scales"].min() >= -100.0 and values["log_scales"].max() < 40.0
     assert np.allclose(np.linalg.norm(values["rotations"], axis=1), 1.0, atol=1e-5)
+
+
+def _bundle(path: Path) -> None:
+    bundle = read_bundle(path)
+    for body in bundle.bodies:
+        assert np.isfinite(body.splats.means.numpy()).all()
+        if body.cage is not None:
+            assert np.isfinite(body.cage.nodes).all() and len(body.cage.nodes) == bundle.frames
 
 
 def _cameras(path: Path) -> list[PosedImage]:
@@ -598,6 +608,8 @@ READERS: tuple[Reader, ...] = (
         **{"name": "lod-meta", "file": "lod-meta.json", "good": _lod_meta, "read": _capture, "json": True},
         other_files=lambda: {f"0_0/{name}": data for name, data in _sog().items()},
     ),
+    Reader("bundle", "a.egs", bundle_bytes, _bundle),
+    Reader("bundle text", "a.egs", lambda: _json(text_of(bundle_bytes())), _bundle, wrap=with_text, json=True),
     Reader("cameras.json", "cameras.json", lambda: _json(_INRIA), _cameras, json=True),
     Reader("transforms.json", "transforms.json", lambda: _json(_TRANSFORMS), _cameras, json=True),
     *(Reader(f"colmap {name}", name, lambda name=name: _COLMAP[name], _colmap, lambda: _COLMAP) for name in _COLMAP),

@@ -31,13 +31,14 @@ mat3 egsPolar(mat3 f) {
   return f;
 }
 
-vec3 egsArm(sampler2D cage, int tet, float share, int own, vec3 mean, vec3 movedMean, vec3 axis, vec3 ownAxis) {
+vec3 egsArm(sampler2D cage, int tet, float share, int own, vec3 mean, vec3 movedMean, vec3 axis, vec3 ownAxis,
+    float maxStretch) {
   if (tet == own) return ownAxis;
   EgsAffine end = egsAffine(cage, tet);
   vec3 endAxis = end.gradient * axis;
   if (share >= 0.0) return share * ownAxis + (1.0 - share) * endAxis;
   vec3 result = endAxis - (egsImage(end, mean) - movedMean) / share;
-  float limit = 1.5 * max(length(ownAxis), length(endAxis)), size = length(result);
+  float limit = maxStretch * max(length(ownAxis), length(endAxis)), size = length(result);
   return size > limit ? result * (limit / size) : result;
 }
 
@@ -77,9 +78,10 @@ float egsLight(sampler2D shade, vec4 region, vec3 p) {
   return mix(1.0, egsShade(shade, uv, 0.02), near);
 }
 
+/* The eye is in the axes of the splats; place is their transform to the world. */
 CovSplat egsDeformed(
     int index, sampler2D splats, sampler2D arms, sampler2D bands, mat4 scales, sampler2D cage, sampler2D shade,
-    vec4 shadeRegion, vec3 eye, int degree) {
+    vec4 shadeRegion, vec3 eye, mat4 place, int degree, float maxStretch) {
   vec4 a = egsTexel(splats, 4 * index), q = egsTexel(splats, 4 * index + 1);
   vec4 s = egsTexel(splats, 4 * index + 2), colour = egsTexel(splats, 4 * index + 3);
   vec3 mean = a.xyz;
@@ -100,12 +102,12 @@ CovSplat egsDeformed(
   mat3 stretched = ownAxes;
   if (straddles) {
     mat3 plus, minus;
-    plus[0] = egsArm(cage, int(e.x), f.z, tet, mean, moved, axes[0], ownAxes[0]);
-    plus[1] = egsArm(cage, int(e.y), f.w, tet, mean, moved, axes[1], ownAxes[1]);
-    plus[2] = egsArm(cage, int(e.z), g.x, tet, mean, moved, axes[2], ownAxes[2]);
-    minus[0] = -egsArm(cage, int(e.w), g.y, tet, mean, moved, -axes[0], -ownAxes[0]);
-    minus[1] = -egsArm(cage, int(f.x), g.z, tet, mean, moved, -axes[1], -ownAxes[1]);
-    minus[2] = -egsArm(cage, int(f.y), g.w, tet, mean, moved, -axes[2], -ownAxes[2]);
+    plus[0] = egsArm(cage, int(e.x), f.z, tet, mean, moved, axes[0], ownAxes[0], maxStretch);
+    plus[1] = egsArm(cage, int(e.y), f.w, tet, mean, moved, axes[1], ownAxes[1], maxStretch);
+    plus[2] = egsArm(cage, int(e.z), g.x, tet, mean, moved, axes[2], ownAxes[2], maxStretch);
+    minus[0] = -egsArm(cage, int(e.w), g.y, tet, mean, moved, -axes[0], -ownAxes[0], maxStretch);
+    minus[1] = -egsArm(cage, int(f.x), g.z, tet, mean, moved, -axes[1], -ownAxes[1], maxStretch);
+    minus[2] = -egsArm(cage, int(f.y), g.w, tet, mean, moved, -axes[2], -ownAxes[2], maxStretch);
     moved += (plus - minus) * h.xyz;
     mat3 average = 0.5 * (plus + minus);
     if (determinant(average) > 0.0) stretched = average;
@@ -115,11 +117,12 @@ CovSplat egsDeformed(
   vec3 direction = normalize(moved - eye);
   if (degree > 0) direction = axes * (transpose(egsPolar(stretched)) * direction);
   CovSplat result;
-  result.center = moved;
+  result.center = (place * vec4(moved, 1.0)).xyz;
   result.flags = GSPLAT_FLAG_ACTIVE;
   result.index = index;
   result.rgba = vec4(max(colour.rgb + egsColour(bands, scales, index, degree, direction), 0.0), s.w);
   if (shadeRegion.z > 0.0) result.rgba.rgb *= egsLight(shade, shadeRegion, moved);
+  covariance = mat3(place) * covariance * transpose(mat3(place));
   result.xxyyzz = max(vec3(covariance[0][0], covariance[1][1], covariance[2][2]), 1e-16);
   result.xyxzyz = vec3(covariance[1][0], covariance[2][0], covariance[2][1]);
   return result;

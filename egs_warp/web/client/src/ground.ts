@@ -5,6 +5,10 @@ import * as THREE from "three";
 import studio from "../../../render/studio.json";
 import { SHADOW_GLSL, WIDE_RADIUS } from "./shadow.glsl";
 
+/** Colour behind a captured scene, and behind the creature if the ground is hidden. */
+export const BACKGROUND = 0xb9bec6;
+/** Depth below which the floor hides splats, in body heights; pressed soles may be below the ground by a part of it. */
+export const FLOOR_DEPTH = 0.015;
 const SHADOW_SIDE = 256;
 /** Radius of the contact shadow, as a fraction of the side of the shadow map. */
 const SOFTNESS = 0.014;

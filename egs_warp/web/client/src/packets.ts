@@ -1,5 +1,7 @@
 // Binary format of a run: one header, then one packet per frame. egs_warp/web/packets.py writes it.
 
+import type { Embedding, SplatData } from "./splats";
+
 export interface Curve {
   name: string;
   title: string;
@@ -24,6 +26,8 @@ export interface Facts {
   motion: { name: string; reached?: Record<string, number> }[];
   notes: string[];
   degree: { splats: number; scene: number };
+  /** Largest stretch of an arm of a splat relative to the material at its two ends. */
+  max_stretch: number;
   /** True if the capture was trained with antialiasing. */
   antialiased: boolean;
   /** True for the still capture that is shown while its creature is prepared. */
@@ -139,6 +143,25 @@ export function readFrames(bytes: ArrayBuffer, start: number): Frame[] {
   return frames;
 }
 
+/** Return the splats of a header whose arrays begin with `name`. */
+export function splatsOf(header: Header, name: "splats" | "scene"): SplatData {
+  return {
+    means: floatsOf(header, `${name}_means`),
+    rotations: floatsOf(header, `${name}_rotations`),
+    scales: floatsOf(header, `${name}_scales`),
+    opacities: floatsOf(header, `${name}_opacities`),
+    colours: floatsOf(header, `${name}_colours`),
+    degree: header.facts.degree[name],
+    bands: bytesOf(header, `${name}_bands`),
+    bandScales: floatsOf(header, `${name}_band_scales`),
+  };
+}
+
+export function embeddingOf(header: Header): Embedding {
+  const { max_stretch: maxStretch } = header.facts;
+  return { meanTets: indicesOf(header, "mean_tets"), arms: floatsOf(header, "arms"), maxStretch };
+}
+
 export function floatsOf(header: Header, name: string): Float32Array {
   const values = header.arrays.get(name);
   if (!(values instanceof Float32Array)) throw new Error(`the run has no ${name}`);
@@ -151,7 +174,7 @@ export function indicesOf(header: Header, name: string): Int32Array {
   return values;
 }
 
-export function bytesOf(header: Header, name: string): Uint8Array {
+function bytesOf(header: Header, name: string): Uint8Array {
   const values = header.arrays.get(name);
   if (!(values instanceof Uint8Array)) throw new Error(`the run has no ${name}`);
   return values;

@@ -68,7 +68,14 @@ export class Page {
   private frameTime = 0;
 
   constructor(root: HTMLElement, sources: FrameSource[]) {
-    this.player = new Player(sources, () => this.update());
+    const film = {
+      rate: (sources[0] as FrameSource).header.facts.rate,
+      // Shorter runs stay at their last frame.
+      get lastFrame(): number {
+        return Math.max(...sources.map((source) => source.frames.length)) - 1;
+      },
+    };
+    this.player = new Player(film, () => this.update());
     const views = element("div", { class: sources.length > 1 ? "views two" : "views" });
     const first = sources[0] as FrameSource;
     document.title = `${first.header.facts.title} \u2013 egs_warp`;

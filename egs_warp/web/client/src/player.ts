@@ -1,6 +1,10 @@
 // Playback state of recorded runs.
 
-import type { FrameSource } from "./frame_source";
+/** What is played: its last frame, and its frames per second. */
+export interface Film {
+  readonly lastFrame: number;
+  readonly rate: number;
+}
 
 export class Player {
   playing = false;
@@ -10,17 +14,16 @@ export class Player {
   framePosition = 0;
 
   constructor(
-    private readonly sources: FrameSource[],
+    private readonly film: Film,
     private readonly onChange: () => void,
   ) {}
 
-  /** Last frame of the longest run; shorter runs stay at their last frame. */
   get lastFrame(): number {
-    return Math.max(...this.sources.map((source) => source.frames.length)) - 1;
+    return this.film.lastFrame;
   }
 
   get rate(): number {
-    return (this.sources[0] as FrameSource).header.facts.rate;
+    return this.film.rate;
   }
 
   get seconds(): number {

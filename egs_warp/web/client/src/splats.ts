@@ -4,9 +4,35 @@
 import { dyno, SplatGenerator } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { floatTexture, TEXTURE_WIDTH } from "./cage";
-import { bytesOf, floatsOf, indicesOf, type Header } from "./packets";
 import { DEFORM_GLSL } from "./deform.glsl";
 import { MARK_GLSL } from "./mark.glsl";
+
+/** Splats at rest. */
+export interface SplatData {
+  means: Float32Array;
+  /** Quaternions w, x, y, z. */
+  rotations: Float32Array;
+  /** Standard deviations. */
+  scales: Float32Array;
+  opacities: Float32Array;
+  /** Colours without the bands above 0. */
+  colours: Float32Array;
+  degree: number;
+  /** Coefficients of the bands above 0 in steps, plus 128, three per coefficient: each coefficient of each splat. */
+  bands: Uint8Array;
+  /** 127 steps of each coefficient. */
+  bandScales: Float32Array;
+}
+
+/** What moves each splat with a cage (Eq. 14). */
+export interface Embedding {
+  /** Tetrahedron t of the mean, or -1 - t for a splat with a row of `arms`. */
+  meanTets: Int32Array;
+  /** Fifteen numbers per row: tetrahedra and shares of the six arms, and three smoothing lengths. */
+  arms: Float32Array;
+  /** Largest stretch of an arm relative to the material at its two ends. */
+  maxStretch: number;
+}
 
 export interface DeformedSplats {
   generator: SplatGenerator;
@@ -17,31 +43,25 @@ export interface DeformedSplats {
 }
 
 interface SplatOptions {
-  isStatic: boolean;
+  embedding?: Embedding;
   shadow?: { texture: THREE.Texture; region: THREE.Vector4 };
   hasMarks?: boolean;
 }
 
-/** Create the splats `name` of a run, deformed by the maps in `cage`.
+/** Create splats that are deformed by the maps in `cage`, and placed by their `generator`.
  *
- * Static splats all use the first tetrahedron. A `shadow` darkens the splats near the ground. With `hasMarks`, the
- * colour of a splat depends on the object to which it belongs. */
+ * Without an `embedding` they are static, and all use the first tetrahedron. A `shadow` darkens the splats near the
+ * ground. With `hasMarks`, the colour of a splat depends on the object to which it belongs. */
 export function deformedSplats(
-  header: Header,
-  name: "splats" | "scene",
+  data: SplatData,
   cage: THREE.DataTexture,
-  { isStatic, shadow, hasMarks = false }: SplatOptions,
+  { embedding, shadow, hasMarks = false }: SplatOptions,
 ): DeformedSplats {
-  const means = floatsOf(header, `${name}_means`);
+  const { means, rotations, scales, opacities, colours, degree } = data;
   const count = means.length / 3;
-  const degree = header.facts.degree[name];
   const splats = floatTexture(4 * count);
-  const rotations = floatsOf(header, `${name}_rotations`);
-  const scales = floatsOf(header, `${name}_scales`);
-  const opacities = floatsOf(header, `${name}_opacities`);
-  const colours = floatsOf(header, `${name}_colours`);
-  const codes = isStatic ? undefined : indicesOf(header, "mean_tets");
-  const armRows = isStatic ? new Float32Array(0) : floatsOf(header, "arms");
+  const codes = embedding?.meanTets;
+  const armRows = embedding?.arms ?? new Float32Array(0);
   let arm = 0;
   for (let i = 0; i < count; i++) {
     const code = codes?.[i] ?? 0;
@@ -56,23 +76,26 @@ export function deformedSplats(
   }
   const arms = floatTexture(4 * Math.max(1, arm));
   for (let k = 0; k < arm; k++) arms.values.set(armRows.subarray(15 * k, 15 * k + 15), 16 * k);
-  const bandScales = [...floatsOf(header, `${name}_band_scales`), ...new Array<number>(16).fill(0)];
+  const bandScales = [...data.bandScales, ...new Array<number>(16).fill(0)];
   const eye = new THREE.Vector3();
   const marks = hasMarks ? markTexture(count) : undefined;
   const activeMark = dyno.dynoInt(-1, "egsActiveMark");
+  const place = new THREE.Matrix4();
   const uniforms = {
     splats: dyno.dynoSampler2D(splats.texture, "egsSplats"),
     arms: dyno.dynoSampler2D(arms.texture, "egsArms"),
-    bands: dyno.dynoSampler2D(bandTexture(bytesOf(header, `${name}_bands`), count, degree), "egsBands"),
+    bands: dyno.dynoSampler2D(bandTexture(data.bands, count, degree), "egsBands"),
     bandScales: dyno.dynoMat4(new THREE.Matrix4().fromArray(bandScales), "egsBandScales"),
     cage: dyno.dynoSampler2D(cage, "egsCage"),
     // Without a shadow the region has size 0 and the texture is not sampled.
     shade: dyno.dynoSampler2D(shadow?.texture ?? cage, "egsShade"),
     shadeRegion: dyno.dynoVec4(shadow?.region ?? new THREE.Vector4(), "egsShadeRegion"),
     eye: dyno.dynoVec3(eye, "egsEye"),
+    place: dyno.dynoMat4(place, "egsPlace"),
     degree: dyno.dynoConst("int", degree),
     marks: dyno.dynoSampler2D(marks?.texture ?? cage, "egsMarks"),
     activeMark,
+    maxStretch: dyno.dynoConst("float", embedding?.maxStretch ?? 1),
   };
   const covGenerator = dyno.dynoBlock({ index: "int" }, { covsplat: dyno.CovSplat }, ({ index }) => {
     if (index === undefined) throw new Error("Spark gave no index");
@@ -87,16 +110,18 @@ export function deformedSplats(
         shade: "sampler2D",
         shadeRegion: "vec4",
         eye: "vec3",
+        place: "mat4",
         degree: "int",
         marks: "sampler2D",
         activeMark: "int",
+        maxStretch: "float",
       },
       outTypes: { covsplat: dyno.CovSplat },
       inputs: { index, ...uniforms },
       globals: () => [dyno.defineGsplat, dyno.defineCovSplat, DEFORM_GLSL, MARK_GLSL],
       statements: ({ inputs: i, outputs }) => [
         `${outputs.covsplat} = egsDeformed(${i.index}, ${i.splats}, ${i.arms}, ${i.bands}, ${i.bandScales}, ` +
-          `${i.cage}, ${i.shade}, ${i.shadeRegion}, ${i.eye}, ${i.degree});`,
+          `${i.cage}, ${i.shade}, ${i.shadeRegion}, ${i.eye}, ${i.place}, ${i.degree}, ${i.maxStretch});`,
         `${outputs.covsplat}.rgba.rgb = ` +
           `egsMarked(${outputs.covsplat}.rgba.rgb, ${i.marks}, ${i.index}, ${i.activeMark});`,
       ],
@@ -106,8 +131,12 @@ export function deformedSplats(
   const generator = new SplatGenerator({
     numSplats: count,
     covGenerator,
-    update: ({ camera }) => {
+    update: ({ object, camera }) => {
+      object.updateWorldMatrix(true, false);
+      if (!place.equals(object.matrixWorld)) object.updateVersion();
+      place.copy(object.matrixWorld);
       camera?.getWorldPosition(eye);
+      object.worldToLocal(eye);
     },
   });
   generator.frustumCulled = false;

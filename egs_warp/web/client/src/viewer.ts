@@ -4,18 +4,15 @@ import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { Cage, identityCage } from "./cage";
 import { splatRenderer, type SplatRenderer } from "./splat_renderer";
-import { Ground } from "./ground";
+import { fitCamera } from "./fit_camera";
+import { BACKGROUND, FLOOR_DEPTH, Ground } from "./ground";
 import { Overlays, type Layer } from "./overlays";
-import { floatsOf, indicesOf, type Frame } from "./packets";
+import { embeddingOf, floatsOf, indicesOf, splatsOf, type Frame } from "./packets";
 import type { FrameSource } from "./frame_source";
 import { deformedSplats, type DeformedSplats } from "./splats";
 
-/** Colour behind a captured scene, and behind the creature if the ground is hidden. */
-export const BACKGROUND = 0xb9bec6;
 /** Fraction of the picture that the body or its run fills in the views front, side and top. */
 const FILL = 0.86;
-/** Depth below which the floor hides splats, in body heights; pressed soles may be below the ground by a part of it. */
-const FLOOR_DEPTH = 0.015;
 /** Height by which the ground must change before a following camera changes its height, in body heights. */
 const GROUND_CHANGE = 0.02;
 /** Fraction of a change of the ground's height by which a following camera moves in one image. */
@@ -65,8 +62,8 @@ export class Viewer {
     const rest = floatsOf(header, "rest");
     this.positions = new Float32Array(rest);
     this.cage = new Cage(rest, indicesOf(header, "tets"));
-    this.splats = deformedSplats(header, "splats", this.cage.texture, {
-      isStatic: false,
+    this.splats = deformedSplats(splatsOf(header, "splats"), this.cage.texture, {
+      embedding: embeddingOf(header),
       hasMarks: header.facts.picking ?? false,
     });
     this.splatRenderer = splatRenderer(this.renderer, header.facts.antialiased, () => this.invalidate());
@@ -79,7 +76,7 @@ export class Viewer {
     this.ground = new Ground(indicesOf(header, "surface"), rest.length / 3, header.facts.height);
     if (header.arrays.has("scene_means")) {
       const { shadow } = this.ground;
-      this.background = deformedSplats(header, "scene", identityCage(), { isStatic: true, shadow });
+      this.background = deformedSplats(splatsOf(header, "scene"), identityCage(), { shadow });
       this.scene.add(this.background.generator);
     }
     this.ground.mesh.visible = this.background === undefined;
@@ -230,15 +227,7 @@ export class Viewer {
     if (width === 0 || height === 0) return;
     this.renderer.setPixelRatio(this.resolution * Math.min(window.devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);
-    const aspect = width / height;
-    // Films are square: in a window that is taller than wide, keep the horizontal field of view.
-    const half = Math.tan((Math.PI * this.filmFov) / 360) / Math.min(aspect, 1);
-    this.camera.fov = (360 / Math.PI) * Math.atan(half);
-    this.camera.aspect = aspect;
-    const { height: body } = this.source.header.facts;
-    this.camera.near = 0.02 * body;
-    this.camera.far = 400 * body;
-    this.camera.updateProjectionMatrix();
+    fitCamera(this.camera, this.filmFov, width / height, this.source.header.facts.height);
     this.invalidate();
   }
 

@@ -1,0 +1,240 @@
+"""Bundles: splats at rest, their cages, and the motion of the cages, in one file (docs/concepts/bundle.md)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.io.atomic import atomic_write
+from egs_warp.io.bundle_arrays import PackedArray, indices, quantised
+from egs_warp.io.bundle_file import BAND_ZERO, HEAD, MAGIC, VERSION, Carrier, read_valid_file
+from egs_warp.io.raw import logits_from_opacities
+from egs_warp.version import __version__
+
+BLOCK_FRAMES = 60
+"""Number of frames of a block; a player starts when it has the first block."""
+_ROTATION_STEP, _SCALE_STEP, _COLOUR_STEP, _ARM_STEP = 1.0 / 512.0, 1.0 / 128.0, 1.0 / 512.0, 1.0 / 4096.0
+"""Steps of rotation vectors in rad, log scales, colours, and of bulges and lengths of arms in standard deviations."""
+
+
+@dataclass(frozen=True)
+class BundleCage:
+    """Cage of a body, the embedding of its n Gaussians, of which r have the carrier ``ARMS``, and its motion."""
+
+    rest_nodes: np.ndarray
+    """(N, 3) float32, rest positions."""
+    cage_tets: np.ndarray
+    """(T, 4) nodes of each tetrahedron."""
+    surface: np.ndarray
+    """(B, 3) nodes of the surface triangles, wound outwards."""
+    tets: np.ndarray
+    """(n,) tetrahedron of each mean."""
+    carriers: np.ndarray
+    """(n,) uint8, ``Carrier``."""
+    arm_tets: np.ndarray
+    """(r, 6) tetrahedra of the ends of the three axes, first the positive and then the negative ends."""
+    arm_shares: np.ndarray
+    """(r, 6) fraction of each semi-axis that lies in the tetrahedron of the mean; used where ``arm_lengths`` is 0."""
+    arm_lengths: np.ndarray
+    """(r, 6) length of a semi-axis that ends beyond the neighbours of that tetrahedron, in standard deviations along
+    its axis; 0 for other semi-axes."""
+    arm_bulges: np.ndarray
+    """(r, 3) shift of the mean by the difference of two opposite semi-axes, in standard deviations along their axis."""
+    max_stretch: float
+    """Largest stretch of a semi-axis relative to the material at its two ends."""
+    nodes: np.ndarray
+    """(F, N, 3) positions of the nodes in each frame."""
+
+
+@dataclass(frozen=True)
+class BundleBody:
+    """Splats that move with a cage, or static splats."""
+
+    name: str
+    splats: GaussianCloud
+    """(n,) at rest, after splitting."""
+    cage: BundleCage | None = None
+    """None for static splats, such as the rest of a scene."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Content of a bundle."""
+
+    bodies: tuple[BundleBody, ...]
+    rate: float
+    """Frames per second."""
+    frames: int
+    """Number of frames of every cage."""
+    facts: Mapping[str, Any]
+    """Further properties of the JSON text: ``title``, ``licence``, ``up``, ``metres_per_unit``, ``height``, ``front``,
+    ``flat_ground``, ``camera``, ``capture``."""
+
+
+def write_bundle(path: Path, bundle: Bundle) -> None:
+    """Write a bundle. Raises ``UserError`` if the file cannot be written."""
+    pieces: list[bytes] = []
+    start = 0
+
+    def stored(arrays: Mapping[str, PackedArray]) -> dict[str, Any]:
+        nonlocal start
+        entries = {}
+        for name, array in arrays.items():
+            pieces.append(array.data())
+            entries[name] = array.entry(start, len(pieces[-1]))
+            start += len(pieces[-1])
+        return entries
+
+    bodies: list[dict[str, Any]] = []
+    for body in bundle.bodies:
+        cage = body.cage
+        facts = {"name": body.name, "count": body.splats.count, "degree": body.splats.sh_degree}
+        facts |= {"antialiased": body.splats.antialiased}
+        if cage is not None:
+            facts |= {"max_stretch": cage.max_stretch}
+        arrays = {**({} if cage is None else _cage_arrays(cage)), **_splat_arrays(body.splats)}
+        bodies.append({**facts, "arrays": stored(arrays)})
+    moving = [(facts, body.cage) for facts, body in zip(bodies, bundle.bodies, strict=True) if body.cage is not None]
+    for facts, _ in moving:
+        facts |= {"blocks": [], "node_error": 0.0}
+    # Blocks of equal time are neighbours in the file, so that all bodies can move when they have arrived.
+    for first in range(0, bundle.frames, BLOCK_FRAMES):
+        for facts, cage in moving:
+            nodes = cage.nodes[first : first + BLOCK_FRAMES]
+            origins, offsets = _quantised_track(nodes)
+            written = origins.numbers[:, None].astype(np.float64) + offsets.numbers
+            error = float(np.linalg.norm(written - nodes, axis=2).max())
+            facts["node_error"] = max(facts["node_error"], error)
+            arrays = stored({"origins": origins, "nodes": offsets})
+            facts["blocks"].append({"first": first, "frames": len(nodes), "arrays": arrays})
+    text = json.dumps(
+        {
+            "format": "egs-bundle",
+            "version": VERSION,
+            "generator": f"egs_warp {__version__}",
+            **bundle.facts,
+            "rate": bundle.rate,
+            "frames": bundle.frames,
+            "bytes": start,
+            "bodies": bodies,
+        },
+        separators=(",", ":"),
+    ).encode()
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(b"".join([HEAD.pack(MAGIC, VERSION, len(text)), text, *pieces]))
+
+
+def read_bundle(path: Path) -> Bundle:
+    """Read a bundle. Raises ``UserError`` for the first of its ``findings``."""
+    file = read_valid_file(path)
+    facts = {name: value for name, value in file.text.items() if name not in _OWN_PROPERTIES}
+    bodies = []
+    for body, arrays, blocks in zip(file.text["bodies"], file.arrays, file.blocks, strict=True):
+        numbers = {name: array.numbers for name, array in arrays.items()}
+        cage = None
+        if "blocks" in body:
+            nodes = np.concatenate([block["origins"].numbers[:, None] + block["nodes"].numbers for block in blocks])
+            tets = numbers["tets"].astype(np.int32)
+            carriers = arrays["carriers"].stored
+            arms = arrays["arm_tets"].stored
+            cage = BundleCage(
+                rest_nodes=numbers["rest_nodes"],
+                cage_tets=numbers["cage_tets"].astype(np.int32),
+                surface=numbers["surface"].astype(np.int32),
+                tets=tets,
+                carriers=carriers,
+                arm_tets=(arms + tets[carriers == Carrier.ARMS, None].astype(arms.dtype)).astype(np.int32),
+                arm_shares=numbers["arm_shares"],
+                arm_lengths=numbers["arm_lengths"],
+                arm_bulges=numbers["arm_bulges"],
+                max_stretch=body["max_stretch"],
+                nodes=nodes,
+            )
+        bodies.append(BundleBody(body["name"], _cloud(numbers, body["antialiased"]), cage))
+    return Bundle(tuple(bodies), file.text["rate"], file.text["frames"], facts)
+
+
+_OWN_PROPERTIES = ("format", "version", "rate", "frames", "bytes", "bodies")
+"""Properties of the JSON text that are not facts."""
+
+
+def _splat_arrays(cloud: GaussianCloud) -> dict[str, PackedArray]:
+    sh = cloud.sh.numpy().astype(np.float64)
+    arrays = {
+        "means": quantised(cloud.means.numpy(), np.uint16),
+        "rotations": quantised(_rotation_vectors(cloud.rotations.numpy()), np.uint16, step=_ROTATION_STEP),
+        "log_scales": quantised(cloud.log_scales.numpy(), np.uint16, step=_SCALE_STEP),
+        "opacities": quantised(cloud.opacities(), np.uint8, step=1.0 / 255.0, lower=0.0),
+        "colours": quantised(0.5 + SH_BAND_0 * sh[:, 0], np.uint16, step=_COLOUR_STEP),
+    }
+    if cloud.sh_degree > 0:
+        bands = sh[:, 1:].transpose(0, 2, 1)
+        step = np.maximum(np.abs(bands).max(axis=(0, 1)), 1e-6) / (BAND_ZERO - 1)
+        arrays["bands"] = quantised(bands, np.uint8, step=step, lower=-BAND_ZERO * step)
+    return arrays
+
+
+def _cloud(numbers: Mapping[str, np.ndarray], antialiased: bool) -> GaussianCloud:
+    band_0 = (numbers["colours"] - 0.5) / SH_BAND_0
+    bands = numbers.get("bands", np.zeros((len(band_0), 3, 0))).transpose(0, 2, 1)
+    return GaussianCloud.from_numpy(
+        numbers["means"],
+        _quaternions(numbers["rotations"]),
+        numbers["log_scales"],
+        logits_from_opacities(numbers["opacities"]),
+        np.concatenate([band_0[:, None], bands], axis=1),
+        antialiased=antialiased,
+    )
+
+
+def _rotation_vectors(quaternions: np.ndarray) -> np.ndarray:
+    """Return axis times angle (n, 3), rad, at most pi, of unit quaternions (n, 4) w, x, y, z."""
+    q = quaternions.astype(np.float64)
+    q = np.where(q[:, :1] < 0.0, -q, q)
+    sines = np.linalg.norm(q[:, 1:], axis=1)
+    angles = 2.0 * np.arctan2(sines, q[:, 0])
+    return q[:, 1:] * np.where(sines > 0.0, angles / np.maximum(sines, 1e-300), 2.0)[:, None]
+
+
+def _quaternions(vectors: np.ndarray) -> np.ndarray:
+    """Return unit quaternions (n, 4) w, x, y, z of axis times angle (n, 3), rad."""
+    halves = 0.5 * np.linalg.norm(vectors, axis=1, keepdims=True)
+    # np.sinc(x) is sin(pi x) / (pi x).
+    return np.concatenate([np.cos(halves), 0.5 * vectors * np.sinc(halves / np.pi)], axis=1)
+
+
+def _cage_arrays(cage: BundleCage) -> dict[str, PackedArray]:
+    rows = cage.carriers == Carrier.ARMS
+    tets = indices(cage.tets)
+    # Most ends are in the tetrahedron of the mean or near it, and small differences are compressed well.
+    ends = cage.arm_tets.astype(tets.stored.dtype) - tets.stored[rows, None]
+    return {
+        "rest_nodes": PackedArray(cage.rest_nodes.astype(np.float32)),
+        "cage_tets": indices(cage.cage_tets),
+        "surface": indices(cage.surface),
+        "tets": tets,
+        "carriers": PackedArray(cage.carriers.astype(np.uint8)),
+        "arm_tets": PackedArray(ends),
+        "arm_shares": quantised(cage.arm_shares, np.uint8, step=1.0 / 255.0, lower=0.0),
+        "arm_lengths": quantised(cage.arm_lengths, np.uint16, step=_ARM_STEP, lower=0.0),
+        "arm_bulges": quantised(cage.arm_bulges, np.uint16, step=_ARM_STEP, lower=0.0),
+    }
+
+
+def _quantised_track(nodes: np.ndarray) -> tuple[PackedArray, PackedArray]:
+    """Return the lower corner of the body in each frame, and the positions (f, N, 3) relative to it.
+
+    The error depends on the size of the body, not on the distance that it covers.
+    """
+    lows = nodes.min(axis=1)
+    origins = lows.astype(np.float32)
+    # No position is below its origin after rounding.
+    origins = np.where(origins > lows, np.nextafter(origins, np.float32(-np.inf)), origins)
+    offsets = quantised(nodes - origins[:, None].astype(np.float64), np.uint16, lower=0.0)
+    return PackedArray(origins), replace(offsets, delta=True)

@@ -1,0 +1,116 @@
+"""Arrays of a bundle: quantised or plain numbers, stored in byte planes and deflated (docs/concepts/bundle.md)."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+TYPES = {name: np.dtype(name).newbyteorder("<") for name in ("uint8", "uint16", "uint32", "float32")}
+"""Stored types by their names in the file; little-endian."""
+_MAX_RATIO = 1032
+"""Largest ratio of inflated to deflated bytes of RFC 1951."""
+
+
+@dataclass(frozen=True)
+class PackedArray:
+    """Numbers as a bundle stores them: ``lower + step * stored``, or ``stored`` without a step."""
+
+    stored: np.ndarray
+    """(n, ...) of one of ``TYPES``."""
+    lower: np.ndarray | None = None
+    """(m,) float64, along the last axis, or (1,)."""
+    step: np.ndarray | None = None
+    """(m,) float64, along the last axis, or (1,)."""
+    error: float | None = None
+    """Largest absolute rounding error."""
+    delta: bool = False
+    """True if the file stores the first item, then the difference of each item and the one before it."""
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """(n, ...) the numbers, float64 if they are quantised."""
+        if self.lower is None or self.step is None:
+            return self.stored
+        return self.lower + self.step * self.stored
+
+    def data(self) -> bytes:
+        """Return the deflated byte planes: byte b of component c of all items, for c and then b."""
+        stored = self.stored
+        if self.delta:
+            stored = np.concatenate([stored[:1], np.diff(stored, axis=0)])
+        width = stored.dtype.itemsize * math.prod(stored.shape[1:])
+        planes = np.ascontiguousarray(stored).view(np.uint8).reshape(len(stored), width).T
+        return zlib.compress(np.ascontiguousarray(planes).tobytes(), 9)
+
+    def entry(self, offset: int, size: int) -> dict[str, Any]:
+        """Return the JSON object that describes this array, whose ``size`` bytes begin at ``offset`` of the data."""
+        entry: dict[str, Any] = {
+            "type": self.stored.dtype.name,
+            "shape": list(self.stored.shape),
+            "offset": offset,
+            "bytes": size,
+        }
+        if self.lower is not None and self.step is not None:
+            entry |= {"lower": self.lower.tolist(), "step": self.step.tolist(), "error": self.error}
+        return entry | ({"delta": True} if self.delta else {})
+
+    @classmethod
+    def from_file(cls, entry: dict[str, Any], data: bytes) -> PackedArray:
+        """Read the array that a JSON ``entry`` describes from the bytes of ``data``.
+
+        Raises ``ValueError`` if the bytes do not hold it.
+        """
+        dtype, shape = TYPES[entry["type"]], entry["shape"]
+        width = dtype.itemsize * math.prod(shape[1:])
+        size = width * shape[0]
+        # Checked before anything is allocated.
+        if size > _MAX_RATIO * len(data):
+            raise ValueError(f"{len(data)} bytes cannot hold an array of shape {shape}")
+        try:
+            inflater = zlib.decompressobj()
+            planes = inflater.decompress(data, size + 1)
+        except zlib.error as error:
+            raise ValueError(f"its bytes cannot be inflated ({error})") from error
+        if len(planes) != size or not inflater.eof:
+            raise ValueError(f"its bytes do not inflate to the {size} bytes of an array of shape {shape}")
+        rows = np.frombuffer(planes, np.uint8).reshape(width, shape[0]).T
+        stored = np.ascontiguousarray(rows).view(dtype).reshape(shape)
+        delta = entry.get("delta", False)
+        if delta:
+            stored = np.cumsum(stored, axis=0, dtype=dtype)
+        if "step" not in entry:
+            return cls(stored, delta=delta)
+        lower, step = (np.array(entry[name], np.float64) for name in ("lower", "step"))
+        return cls(stored, lower, step, entry["error"], delta)
+
+
+def quantised(
+    values: np.ndarray, dtype: type, *, step: np.ndarray | float | None = None, lower: np.ndarray | float | None = None
+) -> PackedArray:
+    """Round ``values`` (n, ...) to whole numbers of steps.
+
+    Args:
+        values: finite numbers.
+        dtype: ``np.uint8`` or ``np.uint16``.
+        step: Step, or steps along the last axis; None uses the smallest that covers the values, and so does a step that
+            is too small for them.
+        lower: Value of the number 0, as ``step``; None uses the minimum.
+    """
+    rows = values.astype(np.float64)
+    axes = tuple(range(rows.ndim - 1)) if rows.ndim > 1 else None
+    low = np.atleast_1d(rows.min(axis=axes) if lower is None else np.asarray(lower, np.float64))
+    smallest = np.atleast_1d(rows.max(axis=axes, initial=-np.inf) - low) / np.iinfo(dtype).max
+    chosen = smallest if step is None else np.maximum(np.atleast_1d(np.asarray(step, np.float64)), smallest)
+    # All values are equal: any step will do.
+    chosen = np.where(chosen > 0.0, chosen, 1.0)
+    stored = np.rint((rows - low) / chosen).astype(dtype)
+    return PackedArray(stored, low, chosen, float(np.abs(low + chosen * stored - rows).max(initial=0.0)))
+
+
+def indices(values: np.ndarray) -> PackedArray:
+    """Store whole numbers, which are not negative, in 16 or 32 bits."""
+    return PackedArray(values.astype(np.uint16 if values.max(initial=0) <= 0xFFFF else np.uint32))

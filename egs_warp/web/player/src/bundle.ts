@@ -1,0 +1,320 @@
+// Reader of bundles (docs/concepts/bundle.md), which are read while they arrive.
+
+import type { Embedding, SplatData } from "../../client/src/splats";
+
+export interface Camera {
+  position: [number, number, number];
+  forward: [number, number, number];
+  /** Vertical field of view, degrees. */
+  fov: number;
+}
+
+/** Properties of the JSON text. */
+export interface Facts {
+  title?: string;
+  licence?: string;
+  up: [number, number, number];
+  metres_per_unit: number;
+  rate: number;
+  frames: number;
+  height?: number;
+  flat_ground?: boolean;
+  camera?: Camera;
+}
+
+export interface BundleCage {
+  rest: Float32Array;
+  tets: Int32Array;
+  /** Triangles of the surface. */
+  surface: Int32Array;
+  embedding: Embedding;
+  /** Node positions of the frames that have arrived. */
+  frames: Float32Array[];
+}
+
+export interface BundleBody {
+  name: string;
+  antialiased: boolean;
+  splats: SplatData;
+  /** Undefined for static splats. */
+  cage?: BundleCage;
+}
+
+export interface Bundle {
+  facts: Facts;
+  bodies: BundleBody[];
+  /** Number of frames that have arrived for all bodies. */
+  readonly available: number;
+  /** Resolves when the whole bundle has arrived, and rejects if it cannot be read to its end. */
+  complete: Promise<void>;
+}
+
+interface Entry {
+  type: keyof typeof TYPES;
+  shape: number[];
+  offset: number;
+  bytes: number;
+  lower?: number[];
+  step?: number[] | undefined;
+  delta?: boolean;
+}
+
+type Entries = Record<string, Entry>;
+
+interface BodyText {
+  name: string;
+  count: number;
+  degree: number;
+  antialiased: boolean;
+  max_stretch?: number;
+  arrays: Entries;
+  blocks?: { first: number; frames: number; arrays: Entries }[];
+}
+
+type Stored = Uint8Array | Uint16Array | Uint32Array | Float32Array;
+type Arrays = Map<string, Stored | Float32Array>;
+
+const TYPES = { uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, float32: Float32Array } as const;
+const MAGIC = "EGSB";
+const VERSION = 1;
+const HEAD_BYTES = 12;
+/** Carriers of splats; see the specification. */
+const TET = 0;
+const RIGID = 2;
+/** First share of a splat that is moved rigidly, as deform.glsl.ts expects it. */
+const RIGID_SHARE = 3;
+/** Number of steps of `bandScales`. */
+const BAND_STEPS = 127;
+
+/** Read a bundle from an address; resolves when its first block has arrived. */
+export async function loadBundle(address: string): Promise<Bundle> {
+  const response = await fetch(address);
+  if (!response.ok || response.body === null) throw new Error(`${address} cannot be read (${response.status})`);
+  return readBundle(response.body);
+}
+
+/** Read a bundle from a stream; resolves when its first block has arrived. */
+export async function readBundle(stream: ReadableStream<Uint8Array>): Promise<Bundle> {
+  const source = new ByteSource(stream);
+  const head = await source.take(HEAD_BYTES);
+  const view = new DataView(head.buffer, head.byteOffset, head.byteLength);
+  if (new TextDecoder().decode(head.subarray(0, 4)) !== MAGIC) throw new Error("this file is not a bundle of egs_warp");
+  const version = view.getUint32(4, true);
+  if (version !== VERSION) throw new Error(`this player reads bundles of version ${VERSION}, not ${version}`);
+  const text = new TextDecoder().decode(await source.take(view.getUint32(8, true)));
+  const { bodies: bodyTexts, ...facts } = JSON.parse(text) as Facts & { bodies: BodyText[] };
+  source.begin();
+
+  const read = async (entries: Entries): Promise<Arrays> => {
+    const arrays: Arrays = new Map();
+    for (const [name, entry] of byOffset(entries)) {
+      // The shader reads the bands as they are stored.
+      arrays.set(name, await numbersOf(source, name === "bands" ? { ...entry, step: undefined } : entry));
+    }
+    return arrays;
+  };
+  const bodies: BundleBody[] = [];
+  for (const body of bodyTexts) bodies.push(bodyOf(body, await read(body.arrays)));
+  const moving = bodies.flatMap(({ cage }, k) => (cage === undefined ? [] : [{ cage, text: bodyTexts[k]! }]));
+  const readBlocks = async (number: number): Promise<void> => {
+    for (const { cage, text: body } of moving) {
+      const block = body.blocks?.[number];
+      if (block !== undefined) cage.frames.push(...framesOf(await read(block.arrays)));
+    }
+  };
+  await readBlocks(0);
+  const count = Math.max(1, ...bodyTexts.map((body) => body.blocks?.length ?? 0));
+  const rest = async (): Promise<void> => {
+    for (let number = 1; number < count; number++) await readBlocks(number);
+  };
+  const complete = rest();
+  // Those who use the promise receive the error.
+  complete.catch(() => {});
+  return {
+    facts,
+    bodies,
+    get available(): number {
+      return moving.length === 0 ? facts.frames : Math.min(...moving.map(({ cage }) => cage.frames.length));
+    },
+    complete,
+  };
+}
+
+/** Bytes of a stream, in order. */
+class ByteSource {
+  private readonly reader: ReadableStreamDefaultReader<Uint8Array>;
+  private chunks: Uint8Array[] = [];
+  private buffered = 0;
+  /** Position in the data of the next byte. */
+  private position = 0;
+
+  constructor(stream: ReadableStream<Uint8Array>) {
+    this.reader = stream.getReader();
+  }
+
+  /** Count positions from the next byte. */
+  begin(): void {
+    this.position = 0;
+  }
+
+  /** Return the bytes of `length` at a position of the data that is not before the next byte. */
+  async takeAt(position: number, length: number): Promise<Uint8Array<ArrayBuffer>> {
+    if (position < this.position) throw new Error("the arrays of this bundle are not in the order of their offsets");
+    if (position > this.position) await this.take(position - this.position);
+    return this.take(length);
+  }
+
+  async take(length: number): Promise<Uint8Array<ArrayBuffer>> {
+    while (this.buffered < length) {
+      const { done, value } = await this.reader.read();
+      if (done) throw new Error("this bundle is incomplete");
+      this.chunks.push(value);
+      this.buffered += value.length;
+    }
+    const result = new Uint8Array(length);
+    let filled = 0;
+    while (filled < length) {
+      const chunk = this.chunks[0]!;
+      const part = chunk.subarray(0, length - filled);
+      result.set(part, filled);
+      filled += part.length;
+      if (part.length === chunk.length) this.chunks.shift();
+      else this.chunks[0] = chunk.subarray(part.length);
+    }
+    this.buffered -= length;
+    this.position += length;
+    return result;
+  }
+}
+
+function byOffset(entries: Entries): [string, Entry][] {
+  return Object.entries(entries).sort(([, a], [, b]) => a.offset - b.offset);
+}
+
+/** Read the numbers of an array. */
+async function numbersOf(source: ByteSource, entry: Entry): Promise<Stored | Float32Array> {
+  const packed = await source.takeAt(entry.offset, entry.bytes);
+  const inflated = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const planes = new Uint8Array(await new Response(inflated).arrayBuffer());
+  const [count = 0, ...others] = entry.shape;
+  const components = others.reduce((product, side) => product * side, 1);
+  const stored = new TYPES[entry.type](count * components);
+  if (planes.length !== stored.byteLength) throw new Error("an array of this bundle has the wrong length");
+  const bytes = new Uint8Array(stored.buffer);
+  const rowBytes = components * stored.BYTES_PER_ELEMENT;
+  for (let plane = 0; plane < rowBytes; plane++) {
+    for (let k = 0; k < count; k++) bytes[k * rowBytes + plane] = planes[plane * count + k]!;
+  }
+  // Typed arrays of integers compute modulo 2 to the number of their bits.
+  if (entry.delta) for (let k = components; k < stored.length; k++) stored[k]! += stored[k - components]!;
+  const { lower, step } = entry;
+  if (lower === undefined || step === undefined) return stored;
+  const numbers = new Float32Array(stored.length);
+  for (let k = 0; k < stored.length; k++) {
+    numbers[k] = lower[k % lower.length]! + step[k % step.length]! * stored[k]!;
+  }
+  return numbers;
+}
+
+function bodyOf(text: BodyText, arrays: Arrays): BundleBody {
+  const splats: SplatData = {
+    means: floats(arrays, "means"),
+    rotations: quaternions(floats(arrays, "rotations")),
+    scales: floats(arrays, "log_scales").map(Math.exp),
+    opacities: floats(arrays, "opacities"),
+    colours: floats(arrays, "colours"),
+    degree: text.degree,
+    ...bandsOf(text, arrays),
+  };
+  const { name, antialiased } = text;
+  if (text.blocks === undefined) return { name, antialiased, splats };
+  const cage: BundleCage = {
+    rest: floats(arrays, "rest_nodes"),
+    tets: Int32Array.from(arrayOf(arrays, "cage_tets")),
+    surface: Int32Array.from(arrayOf(arrays, "surface")),
+    embedding: embeddingOf(arrays, splats, text.max_stretch ?? 1),
+    frames: [],
+  };
+  return { name, antialiased, splats, cage };
+}
+
+function embeddingOf(arrays: Arrays, { scales }: SplatData, maxStretch: number): Embedding {
+  const [tets, carriers, ends] = [arrayOf(arrays, "tets"), arrayOf(arrays, "carriers"), arrayOf(arrays, "arm_tets")];
+  const shares = floats(arrays, "arm_shares");
+  const lengths = floats(arrays, "arm_lengths");
+  const bulges = floats(arrays, "arm_bulges");
+  const meanTets = new Int32Array(tets.length);
+  const modulus = 2 ** (8 * ends.BYTES_PER_ELEMENT);
+  let armCount = 0;
+  for (const carrier of carriers) armCount += Number(carrier !== TET);
+  const arms = new Float32Array(15 * armCount);
+  let [row, out] = [0, 0];
+  for (let i = 0; i < tets.length; i++) {
+    const tet = tets[i]!;
+    meanTets[i] = carriers[i] === TET ? tet : -1 - tet;
+    if (carriers[i] === TET) continue;
+    if (carriers[i] === RIGID) arms[out + 6] = RIGID_SHARE;
+    else {
+      for (let k = 0; k < 6; k++) {
+        const length = lengths[6 * row + k]! * scales[3 * i + (k % 3)]!;
+        arms[out + k] = (ends[6 * row + k]! + tet) % modulus;
+        arms[out + 6 + k] = length > 0 ? -length : shares[6 * row + k]!;
+      }
+      for (let k = 0; k < 3; k++) arms[out + 12 + k] = bulges[3 * row + k]! * scales[3 * i + k]!;
+      row++;
+    }
+    out += 15;
+  }
+  return { meanTets, arms, maxStretch };
+}
+
+/** Return the bands above 0 with all colours of a coefficient side by side, and their scales. */
+function bandsOf(text: BodyText, arrays: Arrays): { bands: Uint8Array; bandScales: Float32Array } {
+  const coefficients = (text.degree + 1) ** 2 - 1;
+  const bands = new Uint8Array(3 * coefficients * text.count);
+  if (coefficients === 0) return { bands, bandScales: new Float32Array(0) };
+  const stored = arrayOf(arrays, "bands");
+  const bandScales = Float32Array.from(text.arrays.bands!.step!, (step) => BAND_STEPS * step);
+  for (let i = 0; i < text.count; i++) {
+    for (let c = 0; c < 3; c++) {
+      for (let k = 0; k < coefficients; k++) {
+        bands[3 * (i * coefficients + k) + c] = stored[(3 * i + c) * coefficients + k]!;
+      }
+    }
+  }
+  return { bands, bandScales };
+}
+
+/** Return quaternions w, x, y, z of vectors that are axis times angle. */
+function quaternions(vectors: Float32Array): Float32Array {
+  const result = new Float32Array((4 * vectors.length) / 3);
+  for (let i = 0; i < vectors.length / 3; i++) {
+    const [x, y, z] = vectors.subarray(3 * i, 3 * i + 3) as unknown as [number, number, number];
+    const angle = Math.hypot(x, y, z);
+    const factor = angle > 0 ? Math.sin(0.5 * angle) / angle : 0.5;
+    result.set([Math.cos(0.5 * angle), factor * x, factor * y, factor * z], 4 * i);
+  }
+  return result;
+}
+
+/** Return the node positions of the frames of a block. */
+function framesOf(arrays: Arrays): Float32Array[] {
+  const [origins, nodes] = [floats(arrays, "origins"), floats(arrays, "nodes")];
+  const width = (3 * nodes.length) / origins.length;
+  return Array.from({ length: origins.length / 3 }, (_, frame) => {
+    const positions = nodes.slice(frame * width, (frame + 1) * width);
+    for (let k = 0; k < width; k++) positions[k]! += origins[3 * frame + (k % 3)]!;
+    return positions;
+  });
+}
+
+function arrayOf(arrays: Arrays, name: string): Stored {
+  const values = arrays.get(name);
+  if (values === undefined) throw new Error(`the bundle has no ${name}`);
+  return values;
+}
+
+function floats(arrays: Arrays, name: string): Float32Array {
+  const values = arrayOf(arrays, name);
+  return values instanceof Float32Array ? values : Float32Array.from(values);
+}

@@ -1,0 +1,14 @@
+// Entry point of the package for pages: defines <egs-player>, with three.js and Spark included.
+
+import { EgsPlayer } from "./element";
+
+if (customElements.get("egs-player") === undefined) customElements.define("egs-player", EgsPlayer);
+
+declare global {
+  interface HTMLElementTagNameMap {
+    "egs-player": EgsPlayer;
+  }
+}
+
+export { EgsPlayer } from "./element";
+export { loadBundle, readBundle } from "./bundle";

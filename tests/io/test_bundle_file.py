@@ -1,0 +1,130 @@
+"""``egs-warp validate`` and the reader name what is wrong with a bundle, one line each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from egs_warp.cli import main
+from egs_warp.errors import UserError
+from egs_warp.io.bundle import read_bundle, write_bundle
+from tests.support.bundles import bundle_bytes, small_bundle, text_of, with_text
+
+
+def _lines(data: bytes, folder: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, list[str]]:
+    """Return the exit status of validate and what it prints about a file of these bytes."""
+    path = folder / "a.egs"
+    path.write_bytes(data)
+    status = main(["validate", str(path)])
+    said = capsys.readouterr()
+    lines = (said.out + said.err).splitlines()
+    assert all(line.startswith(f"{path}: ") for line in lines) and (said.out == "") == (status != 0)
+    return status, [line.removeprefix(f"{path}: ") for line in lines]
+
+
+def test_a_valid_bundle_is_described(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, (line,) = _lines(bundle_bytes(), tmp_path, capsys)
+    assert status == 0
+    assert line.startswith(
+        "valid, version 1, 130 frames, 0.0 MB; block: 7 Gaussians, 8 nodes with an error of at most "
+    )
+    assert line.endswith("; scene: 7 Gaussians, static")
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"", "the file does not begin with EGSB"),
+        (b"PK\3\4" + bytes(60), "the file does not begin with EGSB"),
+        (b"EGSB\2\0\0\0" + bytes(8), "version 2 of the format is not supported; this program reads version 1"),
+        (b"EGSB\1\0\0\0\xff\0\0\0{}", "the JSON text of 255 bytes is longer than the file"),
+        (b"EGSB\1\0\0\0\5\0\0\0hello", "the JSON text cannot be read"),
+        (bundle_bytes()[:-1], "the data have "),
+        (bundle_bytes() + b"x", "the data have "),
+    ],
+)
+def test_a_file_of_another_kind_or_length_is_refused(
+    data: bytes, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, lines = _lines(data, tmp_path, capsys)
+    assert status == 2 and lines[0].startswith(said)
+    with pytest.raises(UserError, match=r"is not a valid bundle: .*; export the run again"):
+        read_bundle(tmp_path / "a.egs")
+
+
+def _arrays(text: dict[str, Any]) -> dict[str, Any]:
+    return text["bodies"][0]["arrays"]
+
+
+def _block(text: dict[str, Any]) -> dict[str, Any]:
+    return text["bodies"][0]["blocks"][1]
+
+
+def _double(entry: dict[str, Any]) -> None:
+    entry["step"] = [0.1 * step for step in entry["step"]]
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda t: t.pop("rate"), "the JSON text: 'rate' is a required property"),
+        (lambda t: t.update(frames=2.0), "frames: 2.0 is not of type 'integer'"),
+        (lambda t: _arrays(t).pop("bands"), "bodies/0/arrays: 'bands' is a required property"),
+        (lambda t: _arrays(t)["means"].pop("error"), "bodies/0/arrays/means: 'error' is a dependency of 'step'"),
+        (lambda t: _arrays(t)["means"].update(type="int8"), "bodies/0/arrays/means/type: 'int8' is not one of"),
+        (lambda t: _arrays(t)["means"].update(shape=[7, 4]), "bodies/0/means: its bytes do not inflate to the 56"),
+        (lambda t: _arrays(t)["means"].update(shape=[70000, 3]), "bodies/0/means: "),
+        (lambda t: _arrays(t)["means"].update(lower=[0, 0]), "bodies/0/means: lower and step have 2 and 3 values"),
+        (lambda t: _double(_arrays(t)["means"]), "bodies/0/means: the error "),
+        (lambda t: _arrays(t)["tets"].update(lower=[0], step=[1], error=0), "bodies/0/tets: it holds whole numbers"),
+        (lambda t: _arrays(t)["tets"].update(offset=0), "bodies/0/tets: its bytes overlap"),
+        (
+            lambda t: [_arrays(t)["bands"].pop(k) for k in ("lower", "step", "error")],
+            "bodies/0: bands are not uint8 with",
+        ),
+        (lambda t: _arrays(t)["bands"].update(lower=[0] * 3), "bodies/0: lower of bands is not -128 steps"),
+        (lambda t: t["bodies"].reverse(), "the arrays are not in order: those of all bodies, then the first blocks"),
+        (lambda t: t["bodies"][1].update(count=6), "bodies/1: means has shape [7, 3], not [6, 3]"),
+        (lambda t: _block(t).update(first=59), "bodies/0: blocks/1: begins at frame 59, not 60"),
+        (lambda t: t.update(frames=131), "bodies/0: its blocks have 130 frames, but the bundle has 131"),
+        (lambda t: t["bodies"][0].update(node_error=1e-3), "bodies/0: node_error 0.001 is larger than"),
+    ],
+)
+def test_each_kind_of_damage_is_named(
+    damage: Callable[[dict[str, Any]], object], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = text_of(bundle_bytes())
+    damage(text)
+    status, lines = _lines(with_text(json.dumps(text).encode()), tmp_path, capsys)
+    assert status == 2 and any(line.startswith(said) for line in lines), lines
+
+
+@pytest.mark.parametrize("name", ["cage_tets", "surface", "tets", "carriers", "arm_tets"])
+def test_an_index_beyond_the_cage_is_found(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = small_bundle()
+    body = made.bodies[0]
+    assert body.cage is not None
+    values = getattr(body.cage, name).copy()
+    values.flat[0] = 200
+    write_bundle(tmp_path / "b.egs", replace(made, bodies=(replace(body, cage=replace(body.cage, **{name: values})),)))
+    status, lines = _lines((tmp_path / "b.egs").read_bytes(), tmp_path, capsys)
+    assert status == 2 and any(line.startswith(f"bodies/0: {name} has the index 200") for line in lines), lines
+
+
+def test_all_findings_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = text_of(bundle_bytes())
+    text["frames"] = 131
+    text["bodies"][1]["count"] = 6
+    status, lines = _lines(with_text(json.dumps(text).encode()), tmp_path, capsys)
+    # The static body has the splats of five arrays and of the bands.
+    assert status == 2 and len(lines) == 7
+
+
+def test_a_missing_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["validate", str(tmp_path / "none.egs")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

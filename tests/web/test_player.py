@@ -1,0 +1,378 @@
+"""The element <egs-player> and the creature for three.js scenes, in a real Chromium."""
+
+from __future__ import annotations
+
+import base64
+import io
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from egs_warp.geometry.camera import Camera
+from egs_warp.io.bundle import read_bundle
+from egs_warp.pipelines.bundle import export_bundle
+from egs_warp.pipelines.finished_run import FinishedRun
+from egs_warp.render.rasteriser import render_gaussians
+from egs_warp.web.player import PLAYER, player_script
+from tests.support.bundles import FRAMES, bundle_bytes
+from tests.support.chromium import NEEDED, wait_until
+from tests.support.static_site import served_folder
+
+pytestmark = [*NEEDED, pytest.mark.skipif(not PLAYER.is_file(), reason="the player is not built; make web builds it")]
+_SIZE = 240
+_BACKGROUND = "#40607f"
+_PACKAGES = PLAYER.parents[1] / "node_modules"
+_HEAD = '<!doctype html><html><head><link rel="icon" href="data:,"></head><body>'
+
+
+@pytest.fixture(scope="module")
+def run(run_folder: Path) -> FinishedRun:
+    return FinishedRun.read(run_folder)
+
+
+@pytest.fixture(scope="module")
+def folder(run: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    export_bundle(run, folder / "a.egs")
+    (folder / "swing.egs").write_bytes(bundle_bytes())
+    (folder / "cut.egs").write_bytes(bundle_bytes()[:-100])
+    (folder / "player.js").write_text(player_script(), encoding="utf-8")
+    shutil.copy(PLAYER.with_name("three.js"), folder / "creature.js")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def site(folder: Path) -> Iterator[str]:
+    with served_folder(folder) as address:
+        yield address
+
+
+def _open(chromium: Any, site: str, folder: Path, body: str) -> tuple[Any, list[str]]:
+    """Open a page with the player and ``body``; returns it and the list of the browser's errors and warnings."""
+    html = f'{_HEAD}<script type="module" src="player.js"></script>{body}</body></html>'
+    (folder / "index.html").write_text(html, encoding="utf-8")
+    page = chromium.new_page(viewport={"width": 640, "height": 480})
+    complaints: list[str] = []
+    page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto(f"{site}/index.html")
+    return page, complaints
+
+
+def _element(attributes: str, name: str = "one") -> str:
+    return f'<egs-player id="{name}" style="width:{_SIZE}px" {attributes}></egs-player>'
+
+
+def _wait_until_ready(page: Any) -> None:
+    wait_until(page, "[...document.querySelectorAll('egs-player')].every((one) => one.readyState === 4)")
+
+
+def _picture(page: Any) -> np.ndarray:
+    """Return the canvas (H, W, 3) in 0 to 1, with its splats sorted."""
+    text = page.evaluate(
+        """async () => {
+            const { view } = document.querySelector("egs-player");
+            await view.drawSorted();
+            return view.canvas.toDataURL("image/png").split(",")[1];
+        }"""
+    )
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB"), np.float64) / 255.0
+
+
+def _camera(page: Any) -> Camera:
+    seen = page.evaluate(
+        """() => {
+            const { camera, controls, canvas } = document.querySelector("egs-player").view;
+            return [camera.position.toArray(), controls.target.toArray(), camera.fov, canvas.width, canvas.height];
+        }"""
+    )
+    eye, target, fov, width, height = seen
+    up = np.array([0.0, 0.0, 1.0])
+    return Camera.look_at(
+        np.array(eye), np.array(target), up, width=width, height=height, vertical_fov_degrees=fov, near=0.02
+    )
+
+
+def _own_picture(run: FinishedRun, page: Any, frame: int) -> np.ndarray:
+    """Return the same frame, rendered by this package with the camera of the page."""
+    cloud = run.deformer().deform(run.trajectory.positions[run.steps[frame]]).cloud
+    red, green, blue = (int(_BACKGROUND[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
+    return np.clip(render_gaussians(cloud, _camera(page), background=(red, green, blue)).colour.numpy(), 0.0, 1.0)
+
+
+def _psnr_on_body(ours: np.ndarray, theirs: np.ndarray) -> float:
+    body = np.abs(ours - ours[0, 0]).max(axis=-1) > 0.02
+    assert 0.02 < body.mean() < 0.9
+    return float(-10.0 * np.log10(((ours - theirs)[body] ** 2).mean()))
+
+
+def test_picture_is_like_our_own_picture_of_the_same_frame(
+    chromium: Any, site: str, folder: Path, run: FinishedRun
+) -> None:
+    page, complaints = _open(chromium, site, folder, _element(f'src="a.egs" background="{_BACKGROUND}"'))
+    _wait_until_ready(page)
+    pictures = []
+    for frame in (0, 12):
+        page.evaluate("(seconds) => { document.querySelector('egs-player').currentTime = seconds; }", frame / 60.0)
+        pictures.append(_picture(page))
+        assert _psnr_on_body(_own_picture(run, page, frame), pictures[-1]) >= 45.0
+    assert _psnr_on_body(_own_picture(run, page, 0), pictures[1]) < 40.0
+    assert complaints == []
+    page.close()
+
+
+def test_the_reader_in_the_browser_agrees_with_ours(chromium: Any, site: str, folder: Path) -> None:
+    page, complaints = _open(chromium, site, folder, "")
+    read = page.evaluate(
+        """async () => {
+            const { loadBundle } = await import("./player.js");
+            const bundle = await loadBundle("swing.egs");
+            await bundle.complete;
+            const [block, scene] = bundle.bodies;
+            const { splats, cage } = block;
+            const list = (values) => values.length === undefined ? values : [...values];
+            const lists = (record) => Object.fromEntries(
+                Object.entries(record).map(([name, values]) => [name, list(values)]));
+            return {
+                splats: lists(splats), embedding: lists(cage.embedding), rest: [...cage.rest], tets: [...cage.tets],
+                surface: [...cage.surface], frames: cage.frames.map((frame) => [...frame]),
+                title: bundle.facts.title, hasCage: scene.cage !== undefined,
+            };
+        }"""
+    )
+    body, _ = read_bundle(folder / "swing.egs").bodies
+    splats, cage = body.splats, body.cage
+    assert cage is not None and read["title"] == "block" and not read["hasCage"]
+    deviations = np.exp(splats.log_scales.numpy())
+    for name, values in {
+        "means": splats.means.numpy(),
+        "scales": deviations,
+        "opacities": splats.opacities(),
+        "colours": 0.5 + 0.28209479 * splats.sh.numpy()[:, 0],
+    }.items():
+        np.testing.assert_allclose(read["splats"][name], values.ravel(), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(read["splats"]["rotations"], splats.rotations.numpy().ravel(), atol=1e-6)
+    bands = np.reshape(read["splats"]["bands"], (splats.count, -1, 3)).astype(float)
+    written = (bands - 128.0) / 127.0 * np.array(read["splats"]["bandScales"])[:, None]
+    np.testing.assert_allclose(written, splats.sh.numpy()[:, 1:], atol=1e-5)
+    np.testing.assert_allclose(read["frames"], cage.nodes.reshape(FRAMES, -1), atol=4e-6)
+    for name, values in {"rest": cage.rest_nodes, "tets": cage.cage_tets, "surface": cage.surface}.items():
+        np.testing.assert_array_equal(read[name], values.ravel())
+    embedding = read["embedding"]
+    assert embedding["maxStretch"] == 1.5
+    np.testing.assert_array_equal(embedding["meanTets"], np.where(cage.carriers == 0, cage.tets, -1 - cage.tets))
+    rows = np.reshape(embedding["arms"], (-1, 15))
+    arms, rigid = rows[[0, 2]], rows[1]
+    assert rigid[6] == 3.0
+    np.testing.assert_array_equal(arms[:, :6], cage.arm_tets)
+    own = deviations[cage.carriers == 1]
+    shares = np.where(cage.arm_lengths > 0, -cage.arm_lengths * np.tile(own, 2), cage.arm_shares)
+    np.testing.assert_allclose(arms[:, 6:12], shares, rtol=1e-5)
+    np.testing.assert_allclose(arms[:, 12:], cage.arm_bulges * own, rtol=1e-5)
+    assert complaints == []
+    page.close()
+
+
+def test_a_bundle_can_play_before_all_of_it_has_arrived(chromium: Any, site: str, folder: Path) -> None:
+    page, complaints = _open(chromium, site, folder, "")
+    arrived = page.evaluate(
+        """async () => {
+            const { readBundle } = await import("./player.js");
+            const bytes = new Uint8Array(await (await fetch("swing.egs")).arrayBuffer());
+            const text = JSON.parse(new TextDecoder().decode(
+                bytes.subarray(12, 12 + new DataView(bytes.buffer).getUint32(8, true))));
+            const length = new DataView(bytes.buffer).getUint32(8, true);
+            const first = 12 + length + text.bodies[0].blocks[1].arrays.origins.offset;
+            let control;
+            const stream = new ReadableStream({ start: (controller) => { control = controller; } });
+            for (let k = 0; k < first; k += 97) control.enqueue(bytes.slice(k, Math.min(k + 97, first)));
+            const bundle = await readBundle(stream);
+            const early = bundle.available;
+            control.enqueue(bytes.slice(first));
+            control.close();
+            await bundle.complete;
+            return [early, bundle.available];
+        }"""
+    )
+    assert arrived == [60, FRAMES] and complaints == []
+    page.close()
+
+
+def test_play_ends_and_loop_does_not(chromium: Any, site: str, folder: Path) -> None:
+    page, complaints = _open(chromium, site, folder, _element('src="a.egs" controls'))
+    _wait_until_ready(page)
+    page.evaluate(
+        """() => {
+            window.heard = [];
+            const one = document.querySelector("egs-player");
+            for (const name of ["play", "pause", "ended", "seeked"]) one.addEventListener(name, () => heard.push(name));
+            one.playbackRate = 2;
+            one.play();
+        }"""
+    )
+    wait_until(page, "heard.includes('ended')")
+    paused, time, duration = page.evaluate(
+        "(({ paused, currentTime, duration }) => [paused, currentTime, duration])(document.querySelector('egs-player'))"
+    )
+    assert paused and time == duration == pytest.approx(12 / 60)
+    assert page.evaluate("heard") == ["play", "ended"]
+    page.evaluate(
+        """() => {
+            window.times = [];
+            const one = document.querySelector("egs-player");
+            one.setAttribute("loop", "");
+            one.addEventListener("timeupdate", () => times.push(one.currentTime));
+            one.play();
+        }"""
+    )
+    wait_until(page, "times.filter((time, k) => k > 0 && time < times[k - 1]).length >= 3")
+    assert page.evaluate("heard") == ["play", "ended", "play"]
+    page.locator("egs-player button[title=Pause]").click()
+    assert page.evaluate("document.querySelector('egs-player').paused")
+    assert complaints == []
+    page.close()
+
+
+def test_slider_keys_and_drag(chromium: Any, site: str, folder: Path) -> None:
+    page, complaints = _open(chromium, site, folder, _element('src="a.egs" controls'))
+    _wait_until_ready(page)
+    page.locator("egs-player input").fill("6")
+    assert page.evaluate("document.querySelector('egs-player').currentTime") == pytest.approx(0.1)
+    # In the middle of the canvas, above the bar.
+    box = page.locator("egs-player").bounding_box()
+    x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.4 * box["height"]
+    before = page.evaluate("document.querySelector('egs-player').view.camera.position.toArray()")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 60, y, steps=4)
+    page.mouse.up()
+    page.wait_for_timeout(300)
+    after = page.evaluate("document.querySelector('egs-player').view.camera.position.toArray()")
+    assert np.linalg.norm(np.subtract(after, before)) > 0.1
+    # Each key moves to the next whole frame.
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("document.querySelector('egs-player').currentTime") == pytest.approx(7 / 60)
+    page.keyboard.press(" ")
+    wait_until(page, "document.querySelector('egs-player').currentTime > 0.13")
+    assert complaints == []
+    page.close()
+
+
+def test_canvas_follows_the_size_of_the_element(chromium: Any, site: str, folder: Path) -> None:
+    page, complaints = _open(chromium, site, folder, _element('src="a.egs"'))
+    _wait_until_ready(page)
+    size = "[one.view.canvas.width, one.view.canvas.height, one.view.camera.aspect]"
+    assert page.evaluate(size) == [_SIZE, _SIZE, 1.0]
+    page.evaluate("document.querySelector('egs-player').style.cssText = 'width: 300px; height: 150px'")
+    wait_until(page, "document.querySelector('egs-player').view.canvas.width === 300")
+    assert page.evaluate(size) == [300, 150, 2.0]
+    assert complaints == []
+    page.close()
+
+
+def test_two_players_on_one_page_are_independent(chromium: Any, site: str, folder: Path) -> None:
+    body = _element('src="a.egs" autoplay loop') + _element('src="swing.egs" controls', "two")
+    page, complaints = _open(chromium, site, folder, body)
+    _wait_until_ready(page)
+    wait_until(page, "one.currentTime > 0")
+    assert page.evaluate("[one.paused, two.paused, two.currentTime]") == [False, True, 0]
+    page.evaluate("two.currentTime = 1.5")
+    assert page.evaluate("[two.currentTime, two.duration]") == [1.5, pytest.approx((FRAMES - 1) / 60)]
+    assert complaints == []
+    page.close()
+
+
+def test_the_poster_is_shown_until_the_first_picture(chromium: Any, site: str, folder: Path) -> None:
+    Image.new("RGB", (8, 8), (255, 0, 0)).save(folder / "poster.png")
+    page, complaints = _open(chromium, site, folder, _element('poster="poster.png"'))
+    poster = "one.shadowRoot.querySelector('img').hidden"
+    assert page.evaluate(poster) is False
+    page.evaluate("one.setAttribute('src', 'a.egs')")
+    _wait_until_ready(page)
+    assert page.evaluate(poster) is True
+    assert complaints == []
+    page.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("none.egs", "cannot be read (404)"), ("cut.egs", "incomplete"), ("player.js", "is not a bundle")],
+)
+def test_a_file_that_cannot_be_read_is_reported(name: str, said: str, chromium: Any, site: str, folder: Path) -> None:
+    page, _ = _open(chromium, site, folder, _element(f'src="{name}" controls'))
+    message = "one.shadowRoot.querySelector('.message')"
+    wait_until(page, f"!{message}.hidden")
+    assert said in page.evaluate(f"{message}.textContent")
+    page.close()
+
+
+def test_removing_the_element_ends_it_and_adding_it_starts_it_again(chromium: Any, site: str, folder: Path) -> None:
+    page, complaints = _open(chromium, site, folder, _element('src="a.egs"'))
+    _wait_until_ready(page)
+    page.evaluate("window.kept = one; kept.remove()")
+    assert page.evaluate("kept.readyState") == 0
+    page.evaluate("document.body.append(kept)")
+    _wait_until_ready(page)
+    assert complaints == []
+    page.close()
+
+
+_SCENE = """
+<script type="importmap">{ "imports": {
+  "three": "./node_modules/three/build/three.module.js", "three/addons/": "./node_modules/three/examples/jsm/",
+  "@sparkjsdev/spark": "./node_modules/@sparkjsdev/spark/dist/spark.module.js"
+} }</script>
+<script type="module">
+import * as THREE from "three";
+import { SparkRenderer } from "@sparkjsdev/spark";
+import { addCreature } from "./creature.js";
+const renderer = new THREE.WebGLRenderer();
+renderer.setSize(240, 240);
+document.body.append(renderer.domElement);
+const scene = new THREE.Scene();
+const camera = new THREE.PerspectiveCamera(40, 1, 0.05, 100);
+camera.position.set(2, 0.5, 3);
+camera.lookAt(2, 0.5, 0);
+const creature = await addCreature(scene, renderer, "a.egs");
+creature.object.position.set(2, 0, 0);
+creature.seek(0.1);
+const other = new THREE.Scene();
+other.add(new SparkRenderer({ renderer }));
+const refused = await addCreature(other, renderer, "a.egs").catch((error) => error.message);
+window.scene = { renderer, scene, camera, creature, refused };
+</script>"""
+
+
+@pytest.mark.skipif(not _PACKAGES.is_dir(), reason="three.js is not installed beside the player; make web installs it")
+def test_a_creature_stands_in_any_scene_of_three(chromium: Any, site: str, folder: Path) -> None:
+    if not (folder / "node_modules").exists():
+        (folder / "node_modules").symlink_to(_PACKAGES)
+    (folder / "scene.html").write_text(f"{_HEAD}{_SCENE}</body></html>", encoding="utf-8")
+    page = chromium.new_page(viewport={"width": 320, "height": 320})
+    complaints: list[str] = []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto(f"{site}/scene.html")
+    wait_until(page, "window.scene !== undefined || false")
+    text = page.evaluate(
+        """async () => {
+            const { renderer, scene, camera } = window.scene;
+            for (let k = 0; k < 20; k++) {
+                renderer.render(scene, camera);
+                await new Promise((resolve) => setTimeout(resolve, 50));
+            }
+            renderer.render(scene, camera);
+            return renderer.domElement.toDataURL("image/png").split(",")[1];
+        }"""
+    )
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("L"), float)
+    rows, columns = np.nonzero(picture > 20)
+    # One metre tall, upright along y, in the middle of the picture: 240 pixels show 2.18 m.
+    assert 90 < np.ptp(rows) < 130 and abs(columns.mean() - 120) < 12 and 40 < np.ptp(columns) < 90
+    assert page.evaluate("window.scene.refused").endswith("has to be created with covSplats: true")
+    assert complaints == []
+    page.close()
