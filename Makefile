@@ -15,7 +15,7 @@ BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 # Errors only: warnings about mirrors and the root user would fill the screen.
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-rest test-all test-page fuzz mutation coverage release setup lint lint-workflows types docs pictures paper build web examples clean
+.PHONY: demo test test-rest test-all test-page fuzz mutation coverage release blender test-blender setup lint lint-workflows types docs pictures paper build web examples clean
 
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
@@ -116,8 +116,23 @@ build: setup web
 	VENV=$(VENV) .ci/package
 	cd $(PLAYER) && npm pack --silent --pack-destination ../../../out/dist
 
+# The Blender extension into out/dist.
+blender:
+	$(PYTHON) .ci/blender_extension.py
+
+# The extension in Blender without a window. Blender's module is a package of 373 MB for Python 3.11, which must not share
+# an environment with the tests.
+BPY := .venv-bpy
+test-blender: setup $(BPY)/setup.stamp
+	EGS_WARP_BPY=$(CURDIR)/$(BPY)/bin/python $(PYTEST) tests/blender
+
+$(BPY)/setup.stamp: Makefile
+	test -x $(BPY)/bin/python || $(PYTHON) -m venv $(BPY)
+	$(BPY)/bin/python -m pip install -qq --disable-pip-version-check bpy==4.5.15
+	touch $@
+
 # Beside them a bill of materials and requirements with hashes; ALSO="win_amd64:3.12 ..." adds those of other platforms.
-release: build
+release: build blender
 	$(BIN)/python .ci/release.py $(ALSO:%=--also %)
 
 $(VENV)/demo.stamp: pyproject.toml constraints.txt
@@ -131,4 +146,4 @@ $(VENV)/setup.stamp: $(VENV)/demo.stamp
 	touch $@
 
 clean:
-	rm -rf $(VENV) out site
+	rm -rf $(VENV) $(BPY) out site

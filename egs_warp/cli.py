@@ -100,7 +100,10 @@ class _Overview(_Parser):
         return "\n".join([*lines, "", _EXIT_STATUSES, ""])
 
 
-_FIRST_EXAMPLES = ("doctor", "samples samples", "animate samples/pawn.ply --up z --out out/jump", "view out/jump")
+_FIRST_EXAMPLES = (
+    *("doctor", "demo", "samples samples"),
+    *("animate samples/pawn.ply --up z --out out/jump", "view out/jump"),
+)
 _EXIT_STATUSES = """exit status:
   0    done
   1    out of memory or disk space, or a disk error; doctor: a required component is missing

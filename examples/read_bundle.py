@@ -16,9 +16,12 @@ class Bundle:
             self.text = json.loads(file.read(int.from_bytes(file.read(4), "little")))
             self._data = file.read()
         self.body = self.text["bodies"][body]
-        self.arrays = a = {name: self._numbers(entry) for name, entry in self.body["arrays"].items()}
+        self.arrays = {name: self._numbers(entry) for name, entry in self.body["arrays"].items()}
         blocks = [{k: self._numbers(entry) for k, entry in block["arrays"].items()} for block in self.body["blocks"]]
         self.nodes = np.concatenate([block["origins"][:, None] + block["nodes"] for block in blocks])
+        self._prepare(self.arrays)
+
+    def _prepare(self, a: dict[str, np.ndarray]) -> None:
         angles, v = np.linalg.norm(a["rotations"], axis=1)[:, None, None] / np.pi, a["rotations"][:, None]
         once, twice = np.cross(v, np.eye(3)), np.cross(v, np.cross(v, np.eye(3)))
         # (n, 3, 3): rows are the axes of each splat.

@@ -6,10 +6,14 @@ import hashlib
 import json
 import re
 import runpy
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
+
+from egs_warp.version import __version__
 
 ROOT = Path(__file__).parents[1]
 RELEASE = runpy.run_path(str(ROOT / ".ci" / "release.py"))
@@ -64,11 +68,36 @@ def test_the_bill_of_materials_lists_every_component_and_its_dependents(wheel: P
     assert RELEASE["bill_of"](wheel, reports(), lock) == bill
 
 
+def project() -> dict[str, Any]:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def test_all_files_state_the_version() -> None:
+    recipe = yaml.safe_load((ROOT / "docs" / "conda" / "recipe.yaml").read_text())
+    assert recipe["context"]["version"] == __version__
+    assert recipe["context"]["python_min"] == project()["requires-python"].removeprefix(">=")
+    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    manifest = tomllib.loads((ROOT / "egs_warp" / "blender" / "blender_manifest.toml").read_text())
+    assert manifest["version"] == __version__
+    assert f"egs_warp-{__version__}-py3-none-any.whl" in (ROOT / "docs" / "guide" / "install.md").read_text()
+
+
+def test_the_conda_recipe_requires_what_the_wheel_requires() -> None:
+    recipe = yaml.safe_load((ROOT / "docs" / "conda" / "recipe.yaml").read_text())
+    names = {"py-opencv": "opencv-python-headless", "matplotlib-base": "matplotlib"}
+    run = [line.split(" ") for line in recipe["requirements"]["run"] if not line.startswith("python ")]
+    assert [names.get(name, name) + bound for name, bound in run] == project()["dependencies"]
+
+
+def test_the_table_of_extras_is_complete() -> None:
+    page = (ROOT / "docs" / "guide" / "install.md").read_text()
+    rows = re.findall(r"^\| (`.*?`) \|", page.partition("| extra |")[2].partition("\n\n")[0], re.MULTILINE)
+    assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == set(project()["optional-dependencies"])
+
+
 def test_every_dependency_is_pinned() -> None:
     """Check the dependencies of the package and of all extras in ``pyproject.toml``."""
-    import tomllib
-
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    asked = [*project["dependencies"], *(line for extra in project["optional-dependencies"].values() for line in extra)]
+    extras = project()["optional-dependencies"].values()
+    asked = [*project()["dependencies"], *(line for extra in extras for line in extra)]
     names = {RELEASE["canonical"](re.match(r"[\w.-]+", line).group()) for line in asked}  # pyright: ignore[reportOptionalMemberAccess]
     assert names <= {RELEASE["canonical"](name) for name in PINNED}

@@ -4,7 +4,7 @@ Input: command-line flags. Output: files and an exit status. No other package ha
 """
 
 GROUPS = {
-    "getting started": ("doctor", "samples"),
+    "getting started": ("doctor", "demo", "samples"),
     "captures": ("pose", "train", "convert"),
     "scenes": ("pick", "plane", "segment", "inpaint"),
     "motion": ("info", "muscles", "animate", "resume", "live"),

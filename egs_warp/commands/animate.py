@@ -142,6 +142,11 @@ def add_parser(commands: Commands) -> None:
         "--metres-per-unit", type=float, help="scale of the capture (default: such that the body is 1 m tall)"
     )
     body.add_argument(
+        "--cage",
+        type=named_path,
+        help="tetrahedra around the object, .mesh, .msh or .vtu (docs/concepts/cage.md; default: made automatically)",
+    )
+    body.add_argument(
         "--muscles",
         type=named_path,
         help="JSON file with muscle fibres (docs/motions/muscles.md; default: placed automatically)",
@@ -365,6 +370,7 @@ def _options(args: argparse.Namespace) -> AnimateOptions:
     from egs_warp.contact.terrain import read_terrain
     from egs_warp.io.text import parse_json, read_text
     from egs_warp.locomotion.settings import LocomotionSettings
+    from egs_warp.meshing.cage_file import read_cage_mesh
     from egs_warp.motions.push import read_pushes
     from egs_warp.motions.script import motion
     from egs_warp.pipelines.animate import AnimateOptions
@@ -388,12 +394,15 @@ def _options(args: argparse.Namespace) -> AnimateOptions:
     script.style(args.style)
     if args.push is not None:
         read_pushes(args.push)
+    if args.cage is not None:
+        read_cage_mesh(args.cage)
     if args.muscles is not None:
         parse_json(read_text(args.muscles), args.muscles)
     creature = replace(
         options.creature,
         front=parse_direction("front", args.front) if args.front is not None else None,
         gravity_up=parse_direction("gravity-up", args.gravity_up) if args.gravity_up is not None else None,
+        cage_file=args.cage,
         muscles_file=args.muscles,
         solids=read_terrain(args.terrain) if args.terrain else (),
         settings=LocomotionSettings(qp_solver=args.qp, strategy=args.strategy),

@@ -17,7 +17,10 @@ from egs_warp.errors import UserError, did_you_mean
 NAME = "run.yaml"
 """Name of the file in the run folder, as in ``egs_warp.io.run_folder``, which is slow to import."""
 _CHECKSUM = "capture_sha256"
-_PATHS = ("capture", "object", "plane", "cameras", "background", "terrain", "muscles", "inpainter", "camera", "beats")
+_PATHS = (
+    *("capture", "object", "plane", "cameras", "background", "terrain", "cage", "muscles"),
+    *("inpainter", "camera", "beats"),
+)
 """Flags that may name files. In the YAML file, these paths are relative to its folder."""
 _WORDS = ("auto", "fixed", "follow", "orbit", "patch", "telea", "ns", TRANSPARENT)
 """Values of these flags that do not name files."""

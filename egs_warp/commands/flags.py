@@ -25,7 +25,7 @@ QP_SOLVERS = ("osqp", "admm", "daqp")
 """Values of ``egs_warp.locomotion.solvers.QpSolver``, repeated here because that module is slow to import."""
 STRATEGIES = ("modes", "paper")
 """Values of ``egs_warp.locomotion.strategies.Strategy``, repeated here because that module is slow to import."""
-_FLAGS = {"muscles_file": "--muscles", "solids": "--terrain"}
+_FLAGS = {"cage_file": "--cage", "muscles_file": "--muscles", "solids": "--terrain"}
 """Flags whose names differ from their library arguments, by argument."""
 
 

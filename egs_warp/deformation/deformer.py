@@ -12,6 +12,7 @@ import warp as wp
 from egs_warp.deformation.embedding import CageLocator, GaussianEmbedding
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io.bundle_file import Carrier
 from egs_warp.kernels.deformation import cage_maps
 from egs_warp.kernels.deformation import deformer as kernels
 from egs_warp.kernels.deformation import deformer_cuda as kernels_cuda
@@ -162,6 +163,23 @@ class Deformer:
                 device=self.rest.device,
             )
         return BendMeasure(bend.numpy(), curl.numpy(), error.numpy())
+
+    def plan_arrays(self) -> dict[str, np.ndarray]:
+        """Return the plan as the arrays of a bundle, for readers without this package (docs/concepts/bundle.md)."""
+        codes, shares = self.plan.mean_tets.numpy(), self.plan.inside_fractions.numpy()
+        rigid = (codes < 0) & (shares[0] == float(cage_maps.RIGID))
+        carriers = np.where(rigid, Carrier.RIGID, np.where(codes < 0, Carrier.ARMS, Carrier.TET)).astype(np.uint8)
+        rows = np.flatnonzero(carriers == Carrier.ARMS)
+        deviations = np.exp(self.rest.log_scales.numpy()[rows].astype(np.float64))
+        arms = shares[:, rows].T
+        return {
+            "tets": np.where(codes < 0, -1 - codes, codes),
+            "carriers": carriers,
+            "arm_tets": self.plan.end_tets.numpy()[:, rows].T,
+            "arm_shares": np.clip(arms, 0.0, 1.0),
+            "arm_lengths": (np.maximum(-arms, 0.0) / np.tile(deviations, 2)).astype(np.float32),
+            "arm_bulges": (self.plan.smoothing_lengths.numpy()[:, rows].T / deviations).astype(np.float32),
+        }
 
     def _kernel_inputs(self, positions: wp.array | np.ndarray) -> list[object]:
         rest = self.rest

@@ -25,6 +25,8 @@ from egs_warp.meshing.tetwild import tetwild
 
 _MIN_DIHEDRAL_DEGREES = 8.0
 _MIN_ENCLOSED_FRACTION = 0.9993
+_MIN_OWN_ENCLOSED_FRACTION = 0.5
+"""Minimum fraction of the object's opacity mass inside a mesh of the user's; less indicates other coordinates."""
 MIN_NODES, MAX_NODES = 50, 20_000
 _MAX_THICKENING = 2.5
 """Largest ``Cage.thickening`` of an object; an object that the elements make thicker is rejected."""
@@ -57,8 +59,8 @@ class Cage:
 
     mesh: TetMesh
     """Tetrahedral mesh in the units and axes of the input cloud."""
-    method: CageMethod
-    """The mesher that was used."""
+    method: CageMethod | None
+    """The mesher that was used; None for a mesh of the user's."""
     min_dihedral_degrees: float
     """Smallest dihedral angle of all tetrahedra."""
     enclosed_opacity_mass: float
@@ -171,6 +173,37 @@ def cage_of_body(
         below_plane_opacity_mass=_share(cloud, solid.below_plane),
         dilation=grown * solid.longest_side,
         thickening=thickening,
+    )
+
+
+def cage_of_mesh(cloud: GaussianCloud, mesh: TetMesh, solid: LatticeSolid) -> Cage:
+    """Return the cage that has the user's own ``mesh``.
+
+    Args:
+        cloud: Gaussians in their body's frame, as for ``cage_of_body``.
+        mesh: tetrahedra in the same frame, above z = 0.
+        solid: the solid that ``cloud`` shows.
+
+    Raises:
+        UserError: the mesh encloses less than half of the object.
+    """
+    everything = np.arange(cloud.count)
+    enclosed = _enclosed_share(cloud, mesh, np.where(solid.belongs, cloud.opacities(), 0.0), everything)
+    if enclosed < _MIN_OWN_ENCLOSED_FRACTION:
+        raise UserError(
+            f"cage: the mesh encloses {100.0 * enclosed:.0f} % of the object; give one around it, in the coordinates"
+            " of the capture",
+            check=("up", "plane"),
+        )
+    return Cage(
+        mesh=mesh,
+        method=None,
+        min_dihedral_degrees=mesh.min_dihedral_degrees(),
+        enclosed_opacity_mass=enclosed,
+        floater_opacity_mass=_share(cloud, ~solid.belongs & ~solid.below_plane),
+        below_plane_opacity_mass=_share(cloud, solid.below_plane),
+        dilation=0.0,
+        thickening=_thickening(cloud, solid, mesh),
     )
 
 

@@ -152,6 +152,7 @@ class AnimateOptions:
             "push": self.push or None,
             "beats": self.beats or None,
             "style": self.style or None,
+            "cage": None if creature.cage_file is None else Path(creature.cage_file).name,
             "muscles": None if creature.muscles_file is None else Path(creature.muscles_file).name,
             "strategy": Strategy(settings.strategy).value,
             "qp": None if settings.qp_solver is None else QpSolver(settings.qp_solver).value,
@@ -268,7 +269,7 @@ def animate(
             quiet=quiet,
         )
         render_data_of_run = RenderData.of(film.splats, film.camera, creature.muscles, performance.place.feet())
-        render_data_of_run.save(run.file(render_data.FILE))
+        render_data_of_run.save(run.file(render_data.FILE), deformer=film.deformer)
         simulation = performance.simulation
         placed_background = creature.placed(background) if background is not None else None
         coverage_warning = ground_coverage_warning(

@@ -9,13 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.deformation.deformer import MAX_STRETCH
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import with_degree
 from egs_warp.io.bundle import Bundle, BundleBody, BundleCage, write_bundle
-from egs_warp.io.bundle_file import Carrier
 from egs_warp.io.run_folder import check_no_file_of_a_run
-from egs_warp.kernels.deformation.cage_maps import RIGID
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.pipelines.export import chosen_frames
 from egs_warp.pipelines.finished_run import FinishedRun
@@ -77,23 +74,12 @@ def bundle_of(run: FinishedRun, *, every: int = 1, degree: int | None = None, li
 
 def _cage(run: FinishedRun, nodes: np.ndarray) -> BundleCage:
     """Return the cage of ``run`` with the positions ``nodes`` (F, N, 3)."""
-    splats, plan = run.creature.splats, run.deformer().plan
-    codes, shares = plan.mean_tets.numpy(), plan.inside_fractions.numpy()
-    rigid = (codes < 0) & (shares[0] == float(RIGID))
-    carriers = np.where(rigid, Carrier.RIGID, np.where(codes < 0, Carrier.ARMS, Carrier.TET)).astype(np.uint8)
-    rows = np.flatnonzero(carriers == Carrier.ARMS)
-    deviations = np.exp(splats.log_scales.numpy()[rows].astype(np.float64))
-    arms = shares[:, rows].T
+    deformer = run.deformer()
     return BundleCage(
         rest_nodes=run.trajectory.rest_positions.astype(np.float32),
         cage_tets=run.trajectory.tets,
         surface=run.mesh.boundary_faces(),
-        tets=np.where(codes < 0, -1 - codes, codes),
-        carriers=carriers,
-        arm_tets=plan.end_tets.numpy()[:, rows].T,
-        arm_shares=np.clip(arms, 0.0, 1.0),
-        arm_lengths=np.maximum(-arms, 0.0) / np.tile(deviations, 2),
-        arm_bulges=plan.smoothing_lengths.numpy()[:, rows].T / deviations,
-        max_stretch=MAX_STRETCH,
+        max_stretch=deformer.max_stretch,
         nodes=nodes,
+        **deformer.plan_arrays(),
     )

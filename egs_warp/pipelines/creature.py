@@ -25,7 +25,8 @@ from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.settling import SHAPE_TOLERANCE, settle, settle_as_captured
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame, representatives
-from egs_warp.meshing.cage import Cage, cage_of_body
+from egs_warp.meshing.cage import Cage, cage_of_body, cage_of_mesh
+from egs_warp.meshing.cage_file import read_cage_in
 from egs_warp.meshing.occupancy import solid_from_gaussians
 from egs_warp.motions.feet import SupportKind, support_kind_of
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs
@@ -69,6 +70,8 @@ class CreatureOptions:
     weight would bend out of shape is made stiffer."""
     nodes: int = 500
     """Approximate number of cage nodes."""
+    cage_file: Path | None = None
+    """Cage (a file of tetrahedra, ``egs_warp.meshing.cage_file``), which replaces the automatic one of ``nodes``."""
     muscles_file: Path | None = None
     """Muscles (JSON, ``egs_warp.muscles.files``); None creates automatic ones."""
     front: Direction | None = None
@@ -195,7 +198,14 @@ def make_creature(
     if front is not None:
         check_front(normal if gravity_up is None else gravity_up, front)
     progress("cage")
-    standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=options.metres_per_unit, nodes=options.nodes)
+    standing = place_cage(
+        cloud,
+        up=up,
+        plane=plane,
+        metres_per_unit=options.metres_per_unit,
+        nodes=options.nodes,
+        cage_file=options.cage_file,
+    )
     return creature_in_cage(cloud, standing, options, notes=notes, progress=progress)
 
 
@@ -334,6 +344,7 @@ def place_cage(
     plane: Plane | None = None,
     metres_per_unit: float | None = None,
     nodes: int = 500,
+    cage_file: Path | None = None,
 ) -> PlacedCage:
     """Find the body's frame on its ground plane, and build its cage in that frame.
 
@@ -343,6 +354,7 @@ def place_cage(
         plane: Ground plane in the capture.
         metres_per_unit: Length of one unit of the capture, m; None makes the body 1 m tall.
         nodes: Approximate number of cage nodes.
+        cage_file: File of the tetrahedra of the cage (``read_cage_mesh``); None makes them.
     """
     near, anchor = centred(representatives(cloud))
     if plane is None:
@@ -353,7 +365,10 @@ def place_cage(
     frame = find_body_frame(near, plane)
     gaussians = body_gaussians(near, frame)
     solid = solid_from_gaussians(gaussians)
-    cage = cage_of_body(gaussians, target_nodes=nodes, solid=solid)
+    if cage_file is None:
+        cage = cage_of_body(gaussians, target_nodes=nodes, solid=solid)
+    else:
+        cage = cage_of_mesh(gaussians, read_cage_in(cage_file, frame.moved(anchor)), solid)
     metres = 1.0 / cage.height(GROUND) if metres_per_unit is None else metres_per_unit / frame.scale
     cage = _rounded(cage.scaled(metres))
     limbs = find_limbs(Sections.of_solid(solid.scaled(metres), cage.mesh), cage.mesh.nodes)

@@ -47,12 +47,17 @@ class Film:
 
     file: str
     """Name of the video in the folder of the run."""
-    splats: GaussianCloud
-    """Gaussians at rest, after splitting; all of them, also if fewer were drawn."""
+    deformer: Deformer
+    """Deformer of the Gaussians after splitting; of all of them, also if fewer were drawn."""
     camera: Camera
     """Camera of the film; for a moving camera, the fixed one that it is derived from."""
     milliseconds: dict[str, list[float]]
     """ms of each frame, by stage; the time of the splitting is divided by the number of frames."""
+
+    @property
+    def splats(self) -> GaussianCloud:
+        """Gaussians at rest, after splitting."""
+        return self.deformer.rest
 
 
 @dataclass(frozen=True)
@@ -119,13 +124,13 @@ def draw_film(
         # Haze of the captured ground, which would be seen below the creature in the air.
         cloud = hidden_below(cloud, GROUND, margin=_BELOW_GROUND * trajectory.height)
     split = split_for_motion(cloud, embedding, [trajectory.positions[step] for step in keys])
-    drawn, drawn_embedding = split.cloud, split.embedding
-    if max_gaussians is not None and drawn.count > max_gaussians:
-        drawn = most_visible(drawn, max_gaussians)
-        drawn_embedding = embed_gaussians(drawn, creature.cage.mesh)
+    deformer = drawn = Deformer(split.cloud, split.embedding)
+    if max_gaussians is not None and split.cloud.count > max_gaussians:
+        visible = most_visible(split.cloud, max_gaussians)
+        drawn = Deformer(visible, embed_gaussians(visible, creature.cage.mesh))
     splitting = 1e3 * (time.perf_counter() - started)
     frames = drawn_frames(
-        Deformer(drawn, drawn_embedding),
+        drawn,
         trajectory,
         steps,
         cameras,
@@ -154,7 +159,7 @@ def draw_film(
     labels = [f"{trajectory.time[steps[i]]:.2f} s" for i in sheet_indices]
     write_png(run.file("sheet.png"), contact_sheet(sheet_images, 4, labels))
     milliseconds["split"] = [splitting / len(steps)]
-    return Film(path.name, split.cloud, camera, milliseconds)
+    return Film(path.name, deformer, camera, milliseconds)
 
 
 def drawn_frames(

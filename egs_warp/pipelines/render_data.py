@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from egs_warp.deformation.deformer import Deformer
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
@@ -70,8 +71,14 @@ class RenderData:
             foot_from_node,
         )
 
-    def save(self, path: Path) -> None:
-        """Write ``creature.npz`` (docs/guide/report.md); equal creatures give equal bytes."""
+    def save(self, path: Path, *, deformer: Deformer | None = None) -> None:
+        """Write ``creature.npz`` (docs/guide/report.md); equal creatures give equal bytes.
+
+        Args:
+            path: The file.
+            deformer: Deformer of ``splats``. Its plan is written too, so that programs without this package can deform
+                the splats.
+        """
         arrays: dict[str, Any] = {name: getattr(self.splats, name).numpy() for name in ARRAYS}
         arrays["antialiased"] = np.bool_(self.splats.antialiased)
         arrays |= {f"camera_{name}": np.asarray(getattr(self.camera, name)) for name in _CAMERA}
@@ -86,6 +93,8 @@ class RenderData:
             "fibre_kinds": np.array(self.fibre_kinds, dtype=np.str_),
             "foot_from_node": self.foot_from_node,
         }
+        if deformer is not None:
+            arrays |= {**deformer.plan_arrays(), "max_stretch": np.float64(deformer.max_stretch)}
         with atomic_write(path) as temporary, temporary.open("wb") as stream:
             np.savez(stream, **arrays)
 
