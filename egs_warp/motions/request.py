@@ -37,3 +37,14 @@ class MotionRequest:
     """Time limit of a motion that is not in the registry, s."""
     style: Style | None = None
     """Style of its jumps, if it differs from that of the run."""
+    layers: tuple[LayerRequest, ...] = ()
+    """Gestures on top of the motion."""
+
+
+@dataclass(frozen=True)
+class LayerRequest:
+    """Request for a gesture on top of a motion."""
+
+    begin: float
+    """Start in seconds after the start of the motion."""
+    request: MotionRequest
