@@ -75,7 +75,7 @@ class _Layer:
             np.zeros((3, 3)) if part.name == WHOLE_BODY else self._share_of_turn(index)
             for index, part in enumerate(gesture.parts)
         ]
-        self._headings = np.zeros(len(gesture.parts))
+        self._headings, self._has_started = np.zeros(len(gesture.parts)), False
         measured = gesture.channels[0]
         sizes = np.linalg.norm(measured.values, axis=1)
         self._size = float(sizes.max())
@@ -170,24 +170,35 @@ class _Layer:
                 target = PostureTarget(target.offset, target.velocity, target.acceleration, turn)
         return target
 
-    def objectives(self, state: BodyState, elapsed: float, dt: float) -> list[AnyObjective]:
+    def at(self, name: str, elapsed: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the value (3,) and the rate (3,) of the part ``name``, ``elapsed`` seconds after the start of the
+        motion; None if the gesture does not move it."""
+        found = [channel for channel in self.gesture.channels if channel.part == name]
+        return found[0].at(elapsed - self.begin) if found else None
+
+    def objectives(self, state: BodyState, elapsed: float, dt: float, active: Sequence[_Layer]) -> list[AnyObjective]:
         """Return the objectives of the parts for the step of ``dt`` seconds that starts ``elapsed`` seconds after the
-        motion."""
+        motion. The values of ``active`` gestures of one part are added, and the first of them returns its objective."""
         axes, rules, body = self._ground.axes, [], self._body
         rate = _RATE * float(np.sqrt(np.linalg.norm(body.gravity) / body.height))
-        for index, (part, channel) in enumerate(zip(self.gesture.parts, self.gesture.channels, strict=True)):
+        for index, part in enumerate(self.gesture.parts):
             if part.name == WHOLE_BODY:
                 continue
             before = self._headings[index]
             heading = heading_between(self._standing, state.positions, self._shares[index], self._ground)
             self._headings[index] = heading
-            heading_rate = (np.remainder(heading - before + np.pi, 2.0 * np.pi) - np.pi) / dt
-            value, value_rate = channel.at(elapsed - self.begin + dt)
+            turned = np.remainder(heading - before + np.pi, 2.0 * np.pi) - np.pi if self._has_started else 0.0
+            targets = {layer: layer.at(part.name, elapsed + dt) for layer in active}
+            moving = {layer: target for layer, target in targets.items() if target is not None}
+            if next(iter(moving)) is not self:
+                continue
+            value, value_rate = np.sum([*moving.values()], axis=0)
             last = value - dt * value_rate
             turning = np.radians(turn_between(last, value) / dt + rate * turn_between(self._value(index, state), last))
-            turning = turning + [0.0, 0.0, heading_rate]
+            turning = turning + [0.0, 0.0, turned / dt]
             ground = Coordinates(axes @ self._ground.rotation_about_up(heading).T, False)
             rules.append(part_angular_velocity(body, part, state, turning, _WEIGHT, ground))
+        self._has_started = True
         return rules
 
 
@@ -195,7 +206,7 @@ class Act:
     """Perform gestures while another motion runs below them, or while the body stands.
 
     A gesture of the whole body replaces the upright posture of a standing body. Where gestures of one part overlap,
-    both act on it.
+    their values are added.
     """
 
     def __init__(
@@ -270,7 +281,7 @@ class Act:
             rules = list(self.below.objectives(state, report, dt))
         else:
             rules = self._standing(state, report, active, turn, elapsed, dt)
-        return [*rules, *(rule for layer in active for rule in layer.objectives(state, elapsed, dt))]
+        return [*rules, *(rule for layer in active for rule in layer.objectives(state, elapsed, dt, active))]
 
     @staticmethod
     def _with_gestures(active: Sequence[_Layer], elapsed: float, nodes: np.ndarray) -> np.ndarray:

@@ -95,6 +95,25 @@ def test_the_rotation_of_a_part_is_no_error_of_the_body(person: Stance) -> None:
     assert apart < 0.1 * tilted
 
 
+def test_overlapping_gestures_of_one_part_are_added(person: Stance) -> None:
+    """There is one objective for the head, whose target is the sum of both curves; a part that has turned with the body
+    before the gesture began does not turn at its start."""
+    shakes = gesture_of("shake", person)
+    state = BodyState(person.standing, 0 * person.standing)
+    targets = []
+    for gestures in ([nod(person, NOD)], [shakes], [nod(person, NOD), shakes]):
+        act = Act(person, [(0.0, gesture) for gesture in gestures])
+        act.objectives(state, None, DT)
+        targets.append(head_objective(act, BodyState(person.standing, 0 * person.standing, 10 * DT)).target)
+    # Rotations about different axes commute only to first order.
+    assert np.allclose(targets[2], targets[0] + targets[1], atol=0.01 * np.abs(targets[2]).max())
+    nodes = nodding(person, 0.0, 60.0)
+    late = Act(person, [(1.0, nod(person, NOD))])
+    late.objectives(BodyState(nodes, 0 * nodes), None, DT)
+    first = head_objective(late, BodyState(nodes, 0 * nodes, 1.0)).target
+    assert abs(first[2]) < 1e-6 and np.abs(first).max() < 1.0
+
+
 def test_the_pose_of_a_walk_contains_its_gestures(person: Stance) -> None:
     walk = Walk(person, straight_route(0.3), 0.1)
     gesture = nod(person, NOD)
