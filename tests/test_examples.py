@@ -37,6 +37,7 @@ def example(name: str) -> ModuleType:
         ("turn", "turn", {"heading_degrees": -90.0, "distance": 0.0, "speed": 1.0}),
         ("dance", "dance", {"tempo": 120.0, "first": 0.6, "beats": 10.0}),
         ("get_up", "stand", {"seconds": 1.0}),
+        ("acting", "look around", {"degrees": 35.0}),
     ],
 )
 def test_example_writes_its_files(tmp_path: Path, name: str, motion: str, asked: dict[str, float]) -> None:
@@ -62,6 +63,7 @@ def test_example_writes_its_files(tmp_path: Path, name: str, motion: str, asked:
         ("jump", ["--size", "0"], "jump.py: --size 0: give a number of pixels from 16 to 4096"),
         ("twist", ["--device", "tpu"], "twist.py: --device tpu: this machine has cpu"),
         ("hop", ["--hops", "0"], "hop.py: motion 1 ('hop x0'): repeat 0; give a whole number"),
+        ("acting", ["--motion", "bow + hop"], "acting.py: motion 1 ('bow + hop'): hop is not a gesture; gestures are"),
         ("finetune", ["--steps", "0"], "finetune.py: give --steps of at least 1"),
     ],
 )

@@ -70,7 +70,8 @@ def add_parser(commands: Commands) -> None:
     common.add_argument(
         "--motion",
         default="jump",
-        help='motion (jump), several as "hop x3, twist 180", or a script.json (docs/motions/index.md)',
+        help='motion (jump), several as "hop x3, twist 180", with a gesture as "walk 1 + nod", or a script.json'
+        " (docs/motions/index.md)",
     )
     motion = animate.add_argument_group("motion")
     body = animate.add_argument_group("body and ground")

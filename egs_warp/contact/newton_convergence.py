@@ -79,7 +79,7 @@ class NewtonProgress:
         values, arrays = _buffers(kernels.ROW_SIZE)
         values[:] = residual, violation, 0.0, *self.row
         inputs, outputs = [np.inf, *arrays[:3]], arrays[3:]
-        launch_cached(kernels.judge_steps_kernel, 1, inputs=inputs, outputs=outputs, device=arrays[0].device)
+        launch_cached(kernels.judge_steps_kernel, 1, inputs=inputs, outputs=outputs, device=wp.get_device("cpu"))
         self.row[:] = values[3:]
 
     def take(self, row: np.ndarray) -> bool:

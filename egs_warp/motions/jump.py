@@ -131,14 +131,14 @@ class Jump:
         # Feet on legs stay where they touch down while the fall is stopped.
         self._landing_time = LANDING_TIME * self._time_unit if on_legs else 0.0
         ahead = ground.axes[0] @ (stance.contact_points - body.centre_of_mass(stance.standing)).T
-        self._style = stance.style
-        self._step, self._max_lean = stance.step, MAX_LEAN * float(ahead.max())
+        self._style, self._step, self._max_lean = stance.style, stance.step, MAX_LEAN * float(ahead.max())
         self.plan = self._plan_for(target)
         self._skips_settling = skips_settling
-        self.phase = JumpPhase.SETTLE
-        self._entered = 0.0
+        self.phase, self._entered = JumpPhase.SETTLE, 0.0
         local = ground.local(stance.standing)
         self._start_com = body.centre_of_mass(local)
+        self.landing_height = float(self._start_com[2])
+        """Height in metres at which the centre of mass of the landed body comes to rest."""
         self._start_base = self._start_com[:2] + self.controller.base_offset
         self._last_pose = self._pose_before = np.eye(3)
         self._requested_velocity: np.ndarray | None = None
@@ -267,9 +267,8 @@ class Jump:
         return measurement.in_contact and measurement.velocity[2] < 0.0 and (low or measurement.normal_load > 1.0)
 
     def _crouch(self, state: BodyState, measurement: Measurement, elapsed: float, dt: float) -> list[AnyObjective]:
-        position, velocity = self._start_com, np.zeros(3)
-        if self.phase is JumpPhase.CROUCH:
-            position, velocity = self.plan.crouch(self._start_com, elapsed)
+        is_down = self.phase is JumpPhase.CROUCH
+        position, velocity = self.plan.crouch(self._start_com, elapsed) if is_down else (self._start_com, np.zeros(3))
         velocity = self._following(measurement, position, velocity, dt)
         pose = self.controller.bent_over_base(position, self._start_base)
         velocity, spin = self.controller.balance_targets(measurement, velocity, self._upright(measurement, pose), dt)
@@ -278,8 +277,7 @@ class Jump:
     def _thrust(self, state: BodyState, measurement: Measurement, elapsed: float, dt: float) -> list[AnyObjective]:
         """Return the objectives of the thrust. Along the ground, the target speed takes the centre of mass from its
         measured position to its position at touch-down."""
-        plan = self.plan
-        position, velocity = plan.thrust(self._start_com, elapsed)
+        plan, (position, velocity) = self.plan, self.plan.thrust(self._start_com, elapsed)
         # Limit the upward speed to the one that free flight to the requested height needs.
         up = min(self._following(measurement, position, velocity, dt)[2], self._sufficient_speed(measurement, dt))
         left = max((plan.speed_up - measurement.velocity[2]) / plan.speed_up * plan.thrust_time, dt)
@@ -358,7 +356,7 @@ class Jump:
 
     def _land(self, state: BodyState, measurement: Measurement, dt: float) -> list[AnyObjective]:
         rate = self.plan.landing_rate
-        goal = np.array([*(measurement.foot_centre - self.controller.base_offset), self._start_com[2]])
+        goal = np.array([*(measurement.foot_centre - self.controller.base_offset), self.landing_height])
         acceleration = rate**2 * (goal - measurement.com) - 2.0 * rate * measurement.velocity
         acceleration[2] = max(acceleration[2], -0.8 * self.gravity)
         acceleration[:2] = self.controller.capture_acceleration(measurement, goal[:2])
@@ -421,8 +419,8 @@ class Jump:
     def _touch_down(self, measurement: Measurement, dt: float) -> tuple[np.ndarray, float]:
         """Predict the touch-down: the centre of mass (3,) when the feet have fallen by their present height, and the
         seconds until then."""
-        drop = max(measurement.com[2] - self._start_com[2], 0.0)
         speed, gap = measurement.velocity[2], max(measurement.sole_height, 0.0)
+        drop = max(measurement.com[2] - self._start_com[2], 0.0)
         latest = max((speed + np.sqrt(max(speed**2 + 2.0 * self.gravity * drop, 0.0))) / self.gravity, dt)
         left = min(max((speed + np.sqrt(speed**2 + 2.0 * self.gravity * gap)) / self.gravity, dt), latest)
         return np.array([*(measurement.com[:2] + measurement.velocity[:2] * left), self._start_com[2]]), left

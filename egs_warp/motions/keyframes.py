@@ -90,6 +90,12 @@ class Channel:
         curve = PchipInterpolator(self.times, self.values, axis=0)
         return curve(inside), curve(inside, 1) * (time < self.times[-1])
 
+    def second_rate(self, time: float) -> np.ndarray:
+        """Return the second derivative (3,) per square second at ``time``; zero after the last key."""
+        if time >= self.times[-1]:
+            return np.zeros(3)
+        return PchipInterpolator(self.times, self.values, axis=0)(time, 2)
+
     def weight_at(self, time: float) -> float:
         """Return the weight of the next key, or of the last key after it."""
         return float(self.weights[min(np.searchsorted(self.times[1:], time), len(self.weights) - 1)])

@@ -8,12 +8,15 @@ from functools import partial
 
 import numpy as np
 
+from egs_warp.motions.act import Act
+from egs_warp.motions.acting import ACTING, ActingKind
 from egs_warp.motions.beats import MAX_BEAT_TIME, MAX_BEATS, even_beats, read_beats
 from egs_warp.motions.command import DrivePlan, read_drive
 from egs_warp.motions.dance import Dance
 from egs_warp.motions.drive import ScriptedDrive
 from egs_warp.motions.follow import Follow
 from egs_warp.motions.gait_selection import move_along, turn_in_place
+from egs_warp.motions.gestures import Gesture
 from egs_warp.motions.get_up import GetUp
 from egs_warp.motions.hop import HopTargets
 from egs_warp.motions.jump import Jump
@@ -59,6 +62,8 @@ class MotionKind:
     """True if the motion accepts a file of beats instead of its numbers."""
     retakes: tuple[Retake, ...] = ()
     """Changes of the motion for the first and each further retake after a fall."""
+    gesture: Callable[[Stance, Mapping[str, float]], Gesture] | None = None
+    """Builds the gesture of a motion that may run on top of another one."""
 
     def usage(self, name: str) -> str:
         """Describe the parameters of the motion called ``name``, for messages."""
@@ -234,6 +239,25 @@ _RUN_RETAKES = tuple(
     for retake in _WALK_RETAKES
 )
 
+
+def _acting_kind(kind: ActingKind) -> MotionKind:
+    return MotionKind(
+        kind.parameters,
+        lambda request, height: _repeat_task(
+            request, _acting_values(request), lambda stance: kind.task(stance, request.asked)
+        ),
+        lambda request: int(np.ceil(kind.frames(request.asked))),
+        jumps=kind.jumps,
+        gesture=kind.gesture,
+    )
+
+
+def _acting_values(request: MotionRequest) -> Mapping[str, float]:
+    """Return the values of the report: turns are also a heading, against which the turn is measured."""
+    turns = request.asked.get("turns")
+    return request.asked if turns is None else {**request.asked, "heading_degrees": 360.0 * turns}
+
+
 MOTIONS: Mapping[str, MotionKind] = {
     "jump": MotionKind(
         (_length("distance", 0.5), _length("height", 0.2, is_exclusive=True)),
@@ -331,6 +355,7 @@ MOTIONS: Mapping[str, MotionKind] = {
         lambda request: int(np.ceil(60.0 * max(key.time for key in _keys(request)))) + TRAJECTORY_TAIL,
         file="a file of key frames, as in trajectory keys.json",
     ),
+    **{name: _acting_kind(kind) for name, kind in ACTING.items()},
 }
 
 
@@ -350,23 +375,42 @@ def kind_of_request(request: MotionRequest) -> MotionKind:
 
 def tasks_of_request(request: MotionRequest, height: float) -> list[MotionTask]:
     """Return the tasks of ``request``, with all repeats, for a body of ``height`` metres, in the style of the request
-    if it has one. The tasks of a retake are gentler, and are judged by the values of the request."""
+    if it has one, and with its gestures. The tasks of a retake are gentler, and are judged by the requested values."""
     kind = kind_of_request(request)
-    parts = kind.build_tasks(request, height)
-    if request.retake == 0:
-        return parts if request.style is None else [_styled(part, request.style, {}) for part in parts]
-    change = kind.retakes[request.retake - 1]
-    gentler = kind.build_tasks(replace(request, asked=change.values(request.asked)), height)
-    begins = [_styled(part, request.style, change.style).begin for part in gentler]
+    factors: Mapping[str, float] = {}
+    parts = gentler = kind.build_tasks(request, height)
+    if request.retake > 0:
+        change = kind.retakes[request.retake - 1]
+        gentler, factors = kind.build_tasks(replace(request, asked=change.values(request.asked)), height), change.style
+    begins = [task.begin for task in gentler]
+    if request.layers:
+        begins = [partial(_begin_with_layers, request, begin) for begin in begins]
+    if request.style is not None or factors:
+        begins = [partial(_begin_in_style, request.style, factors, begin) for begin in begins]
     return [replace(part, begin=begin) for part, begin in zip(parts, begins, strict=True)]
-
-
-def _styled(task: MotionTask, style: Style | None, factors: Mapping[str, float]) -> MotionTask:
-    """Return ``task`` in ``style``, that of the run if it is None, multiplied by ``factors``."""
-    return replace(task, begin=partial(_begin_in_style, style, factors, task.begin))
 
 
 def _begin_in_style(
     style: Style | None, factors: Mapping[str, float], begin: Callable[[Stance], BodyMotion], stance: Stance
 ) -> BodyMotion:
+    """Begin a motion in ``style``, that of the run if it is None, multiplied by ``factors``."""
     return begin(replace(stance, style=(style or stance.style).scaled(factors)))
+
+
+def _begin_with_layers(request: MotionRequest, begin: Callable[[Stance], BodyMotion], stance: Stance) -> BodyMotion:
+    """Begin the motion of ``request`` with its gestures; ``begin`` begins it without them."""
+    gestures = []
+    for layer in request.layers:
+        build = MOTIONS[layer.request.name].gesture
+        assert build is not None
+        gestures.append((layer.begin, build(stance, layer.request.asked)))
+    own = kind_of_request(request).gesture
+    if own is not None:
+        return Act(stance, [(0.0, own(stance, request.asked)), *gestures])
+    return Act(stance, gestures, begin(stance))
+
+
+def frames_of_request(request: MotionRequest) -> int:
+    """Return the number of frames at 60 Hz within which one repeat comes to rest, with its gestures."""
+    layers = [60.0 * layer.begin + frames_of_request(layer.request) for layer in request.layers]
+    return max(kind_of_request(request).frames(request), *map(round, layers), 0)

@@ -39,3 +39,14 @@ class MotionRequest:
     """Style of its jumps, if it differs from that of the run."""
     retake: int = 0
     """Number of times that the motion has been made gentler (``egs_warp.motions.retake``)."""
+    layers: tuple[LayerRequest, ...] = ()
+    """Gestures on top of the motion."""
+
+
+@dataclass(frozen=True)
+class LayerRequest:
+    """Request for a gesture on top of a motion."""
+
+    begin: float
+    """Start in seconds after the start of the motion."""
+    request: MotionRequest

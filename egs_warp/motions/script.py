@@ -1,7 +1,8 @@
 """Scripts of one or several motions, from a line of text or a JSON file.
 
 A line lists motions, separated by commas. Each has its numbers in order or by name, and ``xN`` for N repeats: ``hop x3,
-twist 180, walk 2``, ``jump 0.5 height=0.3``, ``walk to 1,0.5``. A JSON file contains a list of objects: ``[{"motion":
+twist 180, walk 2``, ``jump 0.5 height=0.3``, ``walk to 1,0.5``. ``+`` adds a gesture on top of a motion, ``at`` seconds
+after it has started: ``walk 1 + wave at=0.5``. A JSON file contains a list of objects: ``[{"motion":
 "hop", "repeat": 3}, {"motion": "twist", "heading_degrees": 180}]``.
 """
 
@@ -21,10 +22,11 @@ from egs_warp.io.text import parse_json, read_text, whole_number
 from egs_warp.motions.beats import parse_beats
 from egs_warp.motions.command import Drive, DrivePlan
 from egs_warp.motions.keyframes import Key, checked_keys
-from egs_warp.motions.repertoire import MOTIONS, MotionKind, kind_of_request, tasks_of_request
-from egs_warp.motions.request import MotionRequest
+from egs_warp.motions.repertoire import MOTIONS, MotionKind, frames_of_request, kind_of_request, tasks_of_request
+from egs_warp.motions.request import LayerRequest, MotionRequest
 from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance
 from egs_warp.motions.style import Style, read_style
+from egs_warp.motions.values import Value
 
 MotionFactory: TypeAlias = "Callable[[Stance], BodyMotion]"
 """Function that creates a motion from the stance of a body."""
@@ -32,6 +34,9 @@ MAX_MOTIONS = 100
 _MAX_SECONDS = 3600.0
 """Largest time limit of a motion of the user's own class, s."""
 _NAMES = ", ".join(MOTIONS)
+_GESTURES = tuple(name for name, kind in MOTIONS.items() if kind.gesture is not None)
+_AT = Value("at", 0.0, 0.0, 60.0, "seconds")
+"""Start of a gesture on top of a motion."""
 _BEATS_FILE = "file of beats"
 """Key of the file of beats among the default values of a script."""
 
@@ -58,7 +63,7 @@ class Script:
         Raises:
             UserError: for an invalid file.
         """
-        frames = sum(request.repeat * kind_of_request(request).frames(request) for request in self.requests)
+        frames = sum(request.repeat * frames_of_request(request) for request in self.requests)
         return round(frames * max(1.0, height**0.5))
 
     def style(self, text: str | None) -> Style:
@@ -122,7 +127,7 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
     else:
         # A comma before a number separates two numbers, as in walk to 1,2.
         pieces = [piece.strip() for piece in re.split(r",(?!\s*[-+.]?\d)", text)]
-        requests = [_from_words(piece, defaults, f"motion {number}") for number, piece in enumerate(pieces, start=1)]
+        requests = [_from_piece(piece, defaults, f"motion {number}") for number, piece in enumerate(pieces, start=1)]
     count = sum(request.repeat for request in requests)
     if count > MAX_MOTIONS:
         raise ArgumentError("motion", f"{count} motions are given; at most {MAX_MOTIONS} are allowed")
@@ -176,12 +181,38 @@ def own_script(name: str, begin: MotionFactory, *, seconds: float) -> Script:
     return Script((MotionRequest(name, {}, begin=begin, seconds=seconds),))
 
 
+def _from_piece(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRequest:
+    """Parse a motion and the gestures on top of it."""
+    first, *others = re.split(r"\+(?!\s*[.\d])", piece)
+    layers = []
+    for text in others:
+        words = text.split()
+        if not words:
+            raise UserError(f"{where} ({piece!r}): nothing after +; name a gesture: {', '.join(_GESTURES)}")
+        starts = [word.partition("=")[2] for word in words if word.startswith("at=")]
+        if len(starts) > 1:
+            raise UserError(f"{where} ({piece!r}): at is given twice; give it once")
+        rest = " ".join(word for word in words if not word.startswith("at="))
+        layers.append(_layer(_from_words(rest, {}, where), starts[0] if starts else 0.0, f"{where} ({piece!r})"))
+    return replace(_from_words(first.strip(), defaults, where), layers=tuple(layers))
+
+
+def _layer(request: MotionRequest, begin: Any, where: str) -> LayerRequest:
+    """Return a gesture on top of a motion, ``begin`` seconds after its start."""
+    if MOTIONS[request.name].gesture is None:
+        raise UserError(f"{where}: {request.name} is not a gesture; gestures are: {', '.join(_GESTURES)}")
+    if request.repeat != 1:
+        raise UserError(f"{where}: {request.name} on top of a motion cannot be repeated; add it once more, later")
+    return LayerRequest(_AT.parse(begin, where), request)
+
+
 def _from_words(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRequest:
     words = piece.replace(",", " ").split()
     if not words:
         raise UserError(f"{where}: nothing between two commas; name a motion: {_NAMES}")
-    both = " ".join(words[:2]).lower()
-    name, words = (both, words[2:]) if both in MOTIONS else (words[0].lower(), words[1:])
+    counts = [count for count in (3, 2) if " ".join(words[:count]).lower() in MOTIONS]
+    count = counts[0] if counts else 1
+    name, words = " ".join(words[:count]).lower(), words[count:]
     repeat, values, file = None, {}, None
     kind = _kind(name, where)
     order = [value.name for value in kind.parameters]
@@ -218,6 +249,7 @@ def _from_json(path: Path, defaults: Mapping[str, Any]) -> list[MotionRequest]:
         name = values.pop("motion")
         repeat = values.pop("repeat", 1)
         file = values.pop("file", None)
+        layers = _layers_from_json(values.pop("with", []), where)
         style = _own_style(values.pop("style", None), name, where)
         if not isinstance(repeat, int) or isinstance(repeat, bool):
             raise UserError(f'{where}: "repeat" is {repeat!r}; give a whole number')
@@ -227,8 +259,22 @@ def _from_json(path: Path, defaults: Mapping[str, Any]) -> list[MotionRequest]:
             if isinstance(value, str):
                 raise UserError(f'{where}: "{key}" is the text {json.dumps(value)}; give a number without quotes')
         keyframes = path.parent / file if file is not None else None
-        requests.append(replace(_request(name, values, repeat, keyframes, defaults, where), style=style))
+        request = _request(name, values, repeat, keyframes, defaults, where)
+        requests.append(replace(request, style=style, layers=layers))
     return requests
+
+
+def _layers_from_json(entries: Any, where: str) -> tuple[LayerRequest, ...]:
+    if not isinstance(entries, list):
+        raise UserError(f'{where}: "with" is {json.dumps(entries)}; give a list of gestures')
+    layers = []
+    for entry in entries:
+        if not isinstance(entry, dict) or not isinstance(entry.get("motion"), str):
+            raise UserError(f'{where}: give a "motion" for each gesture of "with", one of {", ".join(_GESTURES)}')
+        values = dict(entry)
+        name, begin = values.pop("motion"), values.pop("at", 0.0)
+        layers.append(_layer(_request(name, values, 1, None, {}, where), begin, where))
+    return tuple(layers)
 
 
 def _own_style(text: Any, name: str, where: str) -> Style | None:

@@ -190,6 +190,9 @@ class BalanceController:
         footprint = ground.local(contact_points)[:, :2] - body.centre_of_mass(local)[:2]
         self.support_low = np.minimum(footprint.min(axis=0), -0.01 * body.height)
         self.support_high = np.maximum(footprint.max(axis=0), 0.01 * body.height)
+        self.gesture_turn = np.zeros(3)
+        """(3,) rotation vector of the body that is due to gestures of its parts, radians, ground axes; the measured
+        rotation does not contain it."""
 
     def balance_targets(
         self, measurement: Measurement, velocity: np.ndarray, spin: np.ndarray, dt: float
@@ -314,7 +317,10 @@ class BalanceController:
 
     def _rotation(self, positions: np.ndarray) -> np.ndarray:
         arms = positions - self.body.centre_of_mass(positions)
-        return kabsch_rotation(self.body.node_mass, self.arms, arms)
+        turn = kabsch_rotation(self.body.node_mass, self.arms, arms)
+        if not self.gesture_turn.any():
+            return turn
+        return Rotation.from_rotvec(-self.gesture_turn @ self.ground.axes).as_matrix() @ turn
 
     def sole_heading(self, positions: np.ndarray) -> float:
         """Return the angle in radians about the up axis by which the feet alone are rotated from the standing pose."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
@@ -15,6 +16,20 @@ from egs_warp.motions.stance import REST_SPEED, BalanceController, RestDetector,
 
 _RATE = 4.0
 """Rate in sqrt(g / H) at which the centre of mass returns over the feet."""
+
+
+@dataclass(frozen=True)
+class PostureTarget:
+    """Target posture of a standing body relative to the upright one, ground axes."""
+
+    offset: np.ndarray
+    """(3,) m, displacement of the centre of mass."""
+    velocity: np.ndarray
+    """(3,) m/s, rate of ``offset``."""
+    acceleration: np.ndarray
+    """(3,) m/s^2, rate of ``velocity``."""
+    turn: np.ndarray
+    """(3,) rotation vector of the body as a whole, radians."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +67,8 @@ class Stand:
         self._gravity = float(np.linalg.norm(stance.body.gravity))
         self._time_unit = float(np.sqrt(stance.body.height / self._gravity))
         self._height = crouch * self.controller.standing_height
+        self.posture: PostureTarget | None = None
+        """Posture of the next time step; None is upright."""
         self._rest_detector = RestDetector(stance.body)
         self._is_resting = at_rest
 
@@ -71,13 +88,22 @@ class Stand:
         slow = bool(np.linalg.norm(measurement.velocity) <= REST_SPEED * np.sqrt(self._gravity * self.body.height))
         self._is_resting = self._rest_detector.update(measurement.velocity, state.time) or (self._is_resting and slow)
         rate = _RATE / self._time_unit
-        goal = np.array([*(measurement.foot_centre - self.controller.base_offset), self._height])
+        goal, posture = np.array([*(measurement.foot_centre - self.controller.base_offset), self._height]), self.posture
+        if posture is not None:
+            goal += posture.offset
         acceleration = rate**2 * (goal - measurement.com) - 2.0 * rate * measurement.velocity
         acceleration[:2] = self.controller.capture_acceleration(measurement, goal[:2])
+        if posture is not None:
+            # Feed-forward: the errors of both laws are relative to the moving goal.
+            rates = np.array([*np.full(2, np.sqrt(self._gravity / self.controller.standing_height)), rate])
+            acceleration += posture.acceleration + 2.0 * rates * posture.velocity
         acceleration[2] = max(acceleration[2], -0.8 * self._gravity)
         velocity = measurement.velocity + dt * acceleration
         heading = self.controller.sole_heading(state.positions)
         pose = self.controller.over_base(measurement.com + dt * velocity, measurement.foot_centre, heading)
+        if posture is not None:
+            axes = self.controller.ground.axes
+            pose = axes.T @ Rotation.from_rotvec(posture.turn).as_matrix() @ axes @ pose
         upright = self.controller.turn_towards(measurement, pose) * 4.0 / self._time_unit
         velocity, spin = self.controller.balance_targets(measurement, velocity, upright, dt)
         return self.controller.objectives(

@@ -5,7 +5,7 @@ See docs/concepts/motions.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +66,7 @@ class Walk:
         *,
         speed: float = 1.0,
         step_fraction: float = 1.0,
+        crouch: float = 1.0,
         control: WalkControl | None = None,
     ) -> None:
         """Plan the walk of the body that stands at ``stance``.
@@ -76,6 +77,7 @@ class Walk:
             step_length: step length in metres; it is reduced to the longest step that the body can make.
             speed: relative to the nominal speed.
             step_fraction: fraction of the longest and most turned steps that are used.
+            crouch: height of the centre of mass between the first and the last phase, relative to its standing height.
             control: weights and gains.
 
         Raises:
@@ -87,7 +89,7 @@ class Walk:
         if not feet:
             raise UserError("walk: the body has no feet, and no flat base of which it could lift a side")
         self.body, self.ground = body, stance.ground
-        self.control = control or WalkControl()
+        self.control, self._crouch = control or WalkControl(), crouch
         normal = stance.ground.axes @ stance.ground.surface_normal
         self._slope = -normal[:2] / normal[2]
         """(2,) slope of the ground: metres of rise per metre forward and to the left."""
@@ -120,6 +122,8 @@ class Walk:
         """Nodes that belong to each foot."""
         self._rate = float(np.sqrt(self.gravity / self._start_com[2]))
         self.phase = WalkPhase.SHIFT
+        self.with_gestures: Callable[[np.ndarray], np.ndarray] | None = None
+        """Function that adds gestures to a pose (N, 3), ground coordinates; None leaves it as it is."""
         self.swing = -1
         self._entered: float | None = None
         self._footprints = self._planner.start
@@ -200,6 +204,8 @@ class Walk:
         before, after = self._foot_targets(elapsed - dt), self._foot_targets(elapsed)
         pose = self._posture.pose(com, self._heading(elapsed - dt), before)
         next_pose = self._posture.pose(com + dt * com_velocity, self._heading(elapsed), after)
+        if self.with_gestures is not None:
+            pose, next_pose = self.with_gestures(pose), self.with_gestures(next_pose)
         spin = (
             control.turn_rate / self._time_unit * self._best_fit_rotation(local, pose)
             + self._best_fit_rotation(pose, next_pose) / dt
@@ -409,9 +415,21 @@ class Walk:
             share = 1.0 - float(np.exp(-self.control.sidestep * dt / self._time_unit))
             self._sidestep = self._sidestep + share * (caught - self._sidestep)
         level = velocity[:2] + dt * self._rate**2 * (com[:2] - pressed)
-        height = self._start_com[2] + self._slope @ (com[:2] - self._start_com[:2])
+        height = self._height(elapsed) + self._slope @ (com[:2] - self._start_com[:2])
         up = self._slope @ velocity[:2] + 6.0 / self._time_unit * (height - com[2])
         return np.array([*level, up])
+
+    def _height(self, elapsed: float) -> float:
+        """Return the target height in metres of the centre of mass on level ground ``elapsed`` seconds into the
+        phase."""
+        depth = 1.0 - self._crouch
+        if self.phase is WalkPhase.SHIFT:
+            depth *= smooth(elapsed / self._duration(self.phase))
+        elif self.phase is WalkPhase.GATHER:
+            depth *= 1.0 - smooth(elapsed / self._duration(self.phase))
+        elif self.phase is WalkPhase.REST:
+            depth = 0.0
+        return float(self._start_com[2]) * (1.0 - depth)
 
     def _foot_targets(self, elapsed: float) -> np.ndarray:
         """Return the target footholds (F, 4) ``elapsed`` seconds into the phase."""

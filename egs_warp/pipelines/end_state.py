@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from egs_warp.locomotion.trajectory import MotionOutcome
+from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.fall_monitor import tips_body
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.sequence import MotionRecord
@@ -84,6 +85,8 @@ class EndCause:
             if not self.has_time_limit:
                 return State.CUT_OFF, []
             missed = ["not at rest within the time limit of the motion"]
+        if isinstance(also_reached, ActOutcome):
+            missed += [gesture.text for gesture in also_reached.gestures if gesture.is_missed]
         slip = getattr(also_reached, "slip", 0.0)
         if self.base is SupportKind.FEET and slip > MAX_SLIP:
             missed.append(f"feet slide by {100.0 * slip:.0f} % of a stride")

@@ -18,6 +18,7 @@ from egs_warp.locomotion.audit import Audit, audit
 from egs_warp.locomotion.ledger import EnergyBalance, EnergyTotals
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory, measure
+from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.sequence import MotionRecord, spans_of
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.end_state import EndCause, State
@@ -84,6 +85,8 @@ class MotionReport:
     def to_json(self) -> dict[str, JsonValue]:
         """Return an element of ``motion``."""
         also = _with_keys(asdict(self.also_reached)) if self.also_reached is not None else {}
+        below = also.pop("below", None)
+        also |= _with_keys(below) if isinstance(below, Mapping) else {}
         return {
             "name": self.name,
             "asked": dict(self.asked),
@@ -102,6 +105,8 @@ def _result(motions: Sequence[MotionReport]) -> str:
         if requested != {0.0}:
             reached = _span([getattr(motion.reached, name) for motion in motions])
             values.append(f"{name.partition('_')[0]} {reached} of {_span(sorted(requested))}{unit}")
+    outcomes = [motion.also_reached.gestures for motion in motions if isinstance(motion.also_reached, ActOutcome)]
+    values += dict.fromkeys(gesture.text.removeprefix(f"{motions[0].name} ") for each in outcomes for gesture in each)
     values.append(f"tilt {_span([motion.reached.tilt_degrees for motion in motions], digits=0)} degrees")
     count = f" x{len(motions)}" if len(motions) > 1 else ""
     # The state comes first in the line.

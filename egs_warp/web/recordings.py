@@ -32,9 +32,13 @@ SCRIPT = "script.json"
 def script_text(requests: Sequence[MotionRequest]) -> str:
     """Return ``requests`` as a script for ``egs-warp animate --motion script.json``."""
     styles = [{} if request.style is None else {"style": str(request.style)} for request in requests]
+    layers = [
+        [{"motion": layer.request.name, "at": layer.begin, **layer.request.asked} for layer in request.layers]
+        for request in requests
+    ]
     lines = [
-        json.dumps({"motion": request.name, **request.asked, **style})
-        for request, style in zip(requests, styles, strict=True)
+        json.dumps({"motion": request.name, **request.asked, **style, **({"with": added} if added else {})})
+        for request, style, added in zip(requests, styles, layers, strict=True)
     ]
     return "[\n" + ",\n".join(f"  {line}" for line in lines) + "\n]\n"
 

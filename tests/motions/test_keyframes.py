@@ -52,6 +52,18 @@ def test_curve_passes_through_keys_starts_at_rest_and_never_overshoots(tmp_path:
     assert channel.at(1.6)[1][0] == 0.0
 
 
+def test_the_second_derivative_is_that_of_the_curve(tmp_path: Path) -> None:
+    """Between two keys it is the difference quotient of the rates; after the last key it is zero."""
+    (channel,) = channels(
+        read_keyframes(written(tmp_path, "k.json", [GOOD, {**GOOD, "time": 1.0, "value": [0, 0, 0]}]))
+    )
+    step = 1e-5
+    for time in (0.2, 0.7):
+        difference = (channel.at(time + step)[1] - channel.at(time - step)[1]) / (2.0 * step)
+        assert channel.second_rate(time) == pytest.approx(difference, rel=1e-6, abs=1e-9)
+    assert np.array_equal(channel.second_rate(1.0), np.zeros(3))
+
+
 def test_feet_have_numbers(tmp_path: Path) -> None:
     path = written(tmp_path, "k.csv", HEADER + "0.5,foot 12,position,0,0,0.1\n0.5,foot,position,0,0,0.1\n")
     assert [k.part for k in read_keyframes(path)] == ["foot 12", "foot"]

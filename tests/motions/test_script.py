@@ -7,12 +7,16 @@ from pathlib import Path
 import pytest
 
 from egs_warp.errors import UserError
+from egs_warp.motions.act import Act
 from egs_warp.motions.command import Drive
 from egs_warp.motions.script import drive_script, motion
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.walk import Walk
 
-KNOWN = "jump, hop, twist, walk, walk to, walk along, run, turn, drive, stand, get up, dance, trajectory"
+KNOWN = (
+    "jump, hop, twist, walk, walk to, walk along, run, turn, drive, stand, get up, dance, trajectory, nod, shake,"
+    " look around, wave, bow, groove, sneak, skip, spin, land and pose"
+)
 
 
 def test_a_line_of_motions() -> None:
@@ -40,6 +44,40 @@ def test_a_json_script_is_the_same_as_its_line(tmp_path: Path) -> None:
         ' {"motion": "trajectory", "file": "keys.csv"}]'
     )
     assert motion(str(path)) == motion(f"hop 0.5 x2, twist 90, trajectory {tmp_path / 'keys.csv'}")
+
+
+def test_gestures_run_on_top_of_a_motion(tmp_path: Path) -> None:
+    """``+`` adds a gesture, ``at`` seconds after the motion has started; in JSON, ``with`` lists them."""
+    walk, look = motion("walk 1 + wave 60 at=0.5 + nod count=3, look around 40 + nod at=2").requests
+    assert (walk.name, walk.asked["distance"]) == ("walk", 1.0)
+    waves, nods = walk.layers
+    assert (waves.begin, waves.request.name, waves.request.asked["degrees"]) == (0.5, "wave", 60.0)
+    assert (nods.begin, nods.request.asked) == (0.0, {"degrees": 20.0, "count": 3.0})
+    assert look.name == "look around" and look.asked == {"degrees": 40.0} and look.layers[0].begin == 2.0
+    path = tmp_path / "acting.json"
+    path.write_text(
+        '[{"motion": "walk", "distance": 1, "with": [{"motion": "wave", "degrees": 60, "at": 0.5},'
+        ' {"motion": "nod", "count": 3}]}]'
+    )
+    assert motion(str(path)).requests == (walk,)
+    assert motion("jump + nod at=20").frames() == 60 * 20 + motion("nod").frames()
+
+
+def test_a_spin_is_measured_as_a_heading(place: Stance) -> None:
+    (spin,) = motion("spin 2").parts(1.0)
+    assert spin.asked == {"turns": 2.0, "height": 0.2, "heading_degrees": 720.0}
+    assert motion("land and pose 0.3 seconds=2").requests[0].asked == {"distance": 0.3, "height": 0.25, "seconds": 2.0}
+    (sneak,) = motion("sneak 0.2").parts(1.0)
+    begun = sneak.begin(place)
+    assert isinstance(begun, Act) and isinstance(begun.below, Walk)
+    assert begun.below.gait.swing_time > motion_walk(place).gait.swing_time
+
+
+def motion_walk(place: Stance) -> Walk:
+    (walk,) = motion("walk 0.2").parts(1.0)
+    begun = walk.begin(place)
+    assert isinstance(begun, Walk)
+    return begun
 
 
 def test_a_run_is_the_quickest_walk_by_the_longest_paces(place: Stance) -> None:
@@ -84,6 +122,14 @@ def test_motions_along_paths_are_parsed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "message"),
     [
+        (
+            "walk + hop",
+            "motion 1 ('walk + hop'): hop is not a gesture; gestures are: nod, shake, look around, wave, bow, ",
+        ),
+        ("walk + nod x2", "motion 1 ('walk + nod x2'): nod on top of a motion cannot be repeated; add it once more"),
+        ("walk + nod at=-1", "motion 1 ('walk + nod at=-1'): at -1: give a number of seconds from 0 to 60"),
+        ("walk + nod at=1 at=2", "motion 1 ('walk + nod at=1 at=2'): at is given twice; give it once"),
+        ("walk + ", "motion 1 ('walk +'): nothing after +; name a gesture: nod, shake, look around"),
         ("fly", f"motion 1: unknown motion 'fly'; known motions are: {KNOWN}"),
         ("jump,", "motion 2: nothing between two commas; name a motion: jump, hop, twist, walk, walk to"),
         ("hop x0", "motion 1 ('hop x0'): repeat 0; give a whole number from 1 to 100"),
@@ -121,6 +167,12 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
         ("[" * 100_000, "its lists are nested too deeply; write fewer levels"),
         ("{}", 'give a list of motions, such as [{"motion": "jump"}]'),
         ("[3]", f', motion 1: give an object with a "motion", one of {KNOWN}'),
+        ('[{"motion": "walk", "with": 3}]', ', motion 1: "with" is 3; give a list of gestures'),
+        (
+            '[{"motion": "walk", "with": ["nod"]}]',
+            ', motion 1: give a "motion" for each gesture of "with", one of nod,',
+        ),
+        ('[{"motion": "walk", "with": [{"motion": "hop"}]}]', ", motion 1: hop is not a gesture; gestures are: nod,"),
         ('[{"motion": "jump", "repeat": 1.5}]', ', motion 1: "repeat" is 1.5; give a whole number'),
         ('[{"motion": "jump", "distance": true}]', "distance True: give a number of body heights from 0 to 10"),
         ('[{"motion": "trajectory", "file": 3}]', '"file" is 3; give the name of a file'),

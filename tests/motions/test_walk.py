@@ -233,6 +233,20 @@ def test_a_narrow_body_leans_in_the_direction_of_travel() -> None:
     np.testing.assert_allclose(wide._lead_at(2.0), 0.0)
 
 
+def test_a_crouch_begins_and_ends_while_all_feet_stand() -> None:
+    """It is reached while the weight shifts, kept during the steps, and left while the feet gather."""
+    place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
+    walk = Walk(place, straight_route(0.1), 0.1, crouch=0.8)
+    standing = float(place.body.centre_of_mass(place.ground.local(place.standing))[2])
+    heights = {}
+    for phase in WalkPhase:
+        walk.phase = phase
+        heights[phase] = [walk._height(share * walk._duration(phase)) / standing for share in (0.0, 0.5, 1.0)]
+    assert np.allclose(heights[WalkPhase.SHIFT], [1.0, 0.9, 0.8]) and np.allclose(heights[WalkPhase.SWING], 0.8)
+    assert np.allclose(heights[WalkPhase.STAND], 0.8) and np.allclose(heights[WalkPhase.GATHER], [0.8, 0.9, 1.0])
+    assert heights[WalkPhase.REST] == [1.0, 1.0, 1.0]
+
+
 def test_headings_of_feet_are_unwrapped() -> None:
     """A measured heading is unwrapped to the value nearest to the planned one."""
     place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place

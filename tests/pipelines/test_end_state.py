@@ -16,8 +16,10 @@ from egs_warp.fem.step_problem import UnsolvableStepError
 from egs_warp.io import write_ply
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.trajectory import MotionOutcome
+from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.feet import SupportKind
+from egs_warp.motions.gestures import GestureOutcome
 from egs_warp.pipelines.end_state import EndCause, State
 from egs_warp.pipelines.finished_run import FinishedRun
 from tests.support.coarse import NODES, coarse_maker
@@ -98,6 +100,18 @@ def test_feet_that_slide_are_reported(base: SupportKind, state: State) -> None:
     result, why = EndCause(base=base).of(entry(), reached(), SimpleNamespace(slip=0.35), last=True)
     assert result is state
     assert why == (["not as requested: feet slide by 35 % of a stride"] if state is State.NOT_AS_REQUESTED else [])
+
+
+@pytest.mark.parametrize(("angle", "state"), [(19.0, State.DONE), (11.0, State.NOT_AS_REQUESTED)])
+def test_a_gesture_that_is_too_small_is_reported(angle: float, state: State) -> None:
+    """It is judged beside the feet of the motion below it."""
+    gesture = GestureOutcome("nod", 20.0, angle, "angle", "degrees")
+    outcome = ActOutcome((gesture,), cast(Any, SimpleNamespace(slip=0.0)))
+    result, why = EndCause(base=SupportKind.FEET).of(entry(), reached(), outcome, last=True)
+    assert result is state
+    assert why == (["not as requested: nod angle 11 of 20 degrees"] if state is State.NOT_AS_REQUESTED else [])
+    slides = ActOutcome((gesture,), cast(Any, SimpleNamespace(slip=0.35)))
+    assert EndCause(base=SupportKind.FEET).of(entry(), reached(), slides, last=True)[0] is State.NOT_AS_REQUESTED
 
 
 def test_a_run_ends_in_the_worst_state_of_its_motions() -> None:

@@ -54,10 +54,12 @@ def test_a_chair_is_described_by_its_measurements(chair: BodyInfo) -> None:
 
 
 def test_all_motions_are_listed(chair: BodyInfo) -> None:
-    assert chair.motions() == dict.fromkeys(MOTIONS)
+    no_branch = "the body has no branch that is free, such as an arm, a tail or an ear; nod or bow"
+    possible = dict.fromkeys(MOTIONS) | {"wave": no_branch}
+    assert chair.motions() == possible
     round_one = inspected(pawn(gaussian_count=3000))
     assert len(round_one.feet) == 1 and "stands   on one base" in round_one.lines()
-    assert round_one.motions() == dict.fromkeys(MOTIONS), "it waddles"
+    assert round_one.motions() == possible, "it waddles"
     assert "jump       yes" in round_one.lines()
 
 

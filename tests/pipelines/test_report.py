@@ -11,6 +11,9 @@ import numpy as np
 from egs_warp.locomotion.audit import Audit
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import MotionOutcome
+from egs_warp.motions.act import ActOutcome
+from egs_warp.motions.footfalls import Footfalls
+from egs_warp.motions.gestures import GestureOutcome
 from egs_warp.pipelines.end_state import State
 from egs_warp.pipelines.report import MotionReport, Report, StageTime, stage_times, versions
 
@@ -52,6 +55,24 @@ def test_the_result_is_one_line_without_exponents() -> None:
     )
     assert verdict == "audit: FAILED: penetration 3.0 times its limit"
     assert repr(report) == f"Report('pawn', {result!r})"
+
+
+def test_gestures_are_in_the_result_beside_the_motion_below() -> None:
+    nod = GestureOutcome("nod", 20.0, 19.46, "angle", "degrees")
+    footfalls = Footfalls(slip=0.01, sole_shift=0.02, landings=4)
+    walk = dataclasses.replace(
+        motion_report("walk", {"distance": 1.0}, distance=0.998), also_reached=ActOutcome((nod,), footfalls)
+    )
+    alone = dataclasses.replace(motion_report("nod", {}), also_reached=ActOutcome((nod,), None))
+    result, _ = dataclasses.replace(_report(), motion=(walk, alone)).summary().splitlines()
+    assert result == (
+        "walk: distance 1 of 1 body heights, nod angle 19 of 20 degrees, tilt 1 degrees, then"
+        " nod: angle 19 of 20 degrees, tilt 1 degrees"
+    )
+    written = dataclasses.replace(walk, planned=footfalls).to_json()["reached"]
+    assert isinstance(written, dict) and "below" not in written
+    assert (written["slip"], written["landings"], written["distance"]) == (0.01, 4, 0.998)
+    assert list(written["gestures"]) == [dataclasses.asdict(nod)]  # pyright: ignore[reportArgumentType]
 
 
 def _report() -> Report:

@@ -27,6 +27,9 @@ def test_a_script_lists_the_motions(tmp_path: Path):
     path = tmp_path / "script.json"
     path.write_text(script_text(asked.requests))
     assert motion(str(path)) == asked
+    layered = motion("walk 0.3 + nod 15 at=0.5, bow")
+    path.write_text(script_text(layered.requests))
+    assert motion(str(path)) == layered
     assert json.loads(script_text([MotionRequest("jump", {"distance": 0.5, "height": 0.2})])) == [
         {"motion": "jump", "distance": 0.5, "height": 0.2}
     ]

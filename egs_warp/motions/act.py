@@ -1,0 +1,321 @@
+"""Gestures on top of another motion, or of standing (docs/motions/gestures.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from egs_warp.errors import UserError
+from egs_warp.fem.body import BodyState
+from egs_warp.geometry.frames import kabsch_rotation
+from egs_warp.locomotion.objectives import AnyObjective, BodyPart, Coordinates, part_angular_velocity, part_nodes
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.follow import turn_between
+from egs_warp.motions.gestures import WHOLE_BODY, Gesture, GestureOutcome
+from egs_warp.motions.jump import Jump
+from egs_warp.motions.keyframes import Quantity
+from egs_warp.motions.sequence import BodyMotion, Stance
+from egs_warp.motions.stance import heading_between
+from egs_warp.motions.stand import PostureTarget, Stand
+from egs_warp.motions.walk import Walk
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+_WEIGHT = 600.0
+"""Weight of the angular velocity of a part, as large as that of balance."""
+_RATE = 6.0
+"""Rate in sqrt(g / H) at which an error of an orientation is corrected."""
+_BASE_WEIGHT = 5.0
+"""Weight of the velocity of the base, which stays where it is while the body above it moves."""
+
+
+_JOINT_SHARE, _SMALL_TURN = 0.25, 0.1
+"""Fraction of the nodes of a part, those nearest to the rest of the body, whose middle is its joint, and angle in
+radians by which a part is rotated to find its share of the rotation of the body."""
+
+
+@dataclass(frozen=True)
+class ActPlan:
+    """Planned quantities of gestures."""
+
+    duration: float
+    """Time of the last key, s."""
+
+
+@dataclass(frozen=True)
+class ActOutcome:
+    """Measured gestures, and what the motion below them measures."""
+
+    gestures: tuple[GestureOutcome, ...]
+    below: DataclassInstance | None
+    """Quantities of the motion below, see ``BodyMotion.outcome_record``."""
+
+    @property
+    def slip(self) -> float:
+        """Largest slip of a foot of the motion below, as a fraction of its stride."""
+        return float(getattr(self.below, "slip", 0.0))
+
+
+class _Layer:
+    """Gesture that starts ``begin`` seconds after the motion."""
+
+    def __init__(self, stance: Stance, gesture: Gesture, begin: float) -> None:
+        self.gesture, self.begin, self.end = gesture, begin, begin + gesture.duration
+        self._ground, self._body, self._standing = stance.ground, stance.body, stance.standing
+        self._shares = [self._rest(part) for part in gesture.parts]
+        self._joints = [part.nodes if part.name == WHOLE_BODY else self._joint(part) for part in gesture.parts]
+        self._turned = [
+            np.zeros((3, 3)) if part.name == WHOLE_BODY else self._share_of_turn(index)
+            for index, part in enumerate(gesture.parts)
+        ]
+        self._headings, self._has_started = np.zeros(len(gesture.parts)), False
+        measured = gesture.channels[0]
+        sizes = np.linalg.norm(measured.values, axis=1)
+        self._size = float(sizes.max())
+        self._extremes = [k for k in range(len(sizes)) if sizes[k] > (1.0 - 1e-9) * self._size]
+        self._reached = dict.fromkeys(self._extremes, 0.0)
+
+    def _rest(self, part: BodyPart) -> np.ndarray:
+        """Return weights (N,) of the nodes outside ``part``, whose rotation about the up axis is the heading."""
+        mass = self._body.node_mass.copy()
+        if part.name != WHOLE_BODY:
+            mass[part.nodes] = 0.0
+        return mass / mass.sum()
+
+    def _joint(self, part: BodyPart) -> np.ndarray:
+        """Return the indices of the nodes whose middle is the joint of ``part`` with the rest of the body."""
+        middle = self._rest(part) @ self._standing
+        away = np.linalg.norm(self._standing[part.nodes] - middle, axis=1)
+        return part.nodes[away <= np.quantile(away, _JOINT_SHARE)]
+
+    def _share_of_turn(self, index: int) -> np.ndarray:
+        """Return the matrix (3, 3) from a small rotation of a part about its joint to the best-fit rotation of the
+        whole body, ground axes."""
+        body, axes, turns = self._body, self._ground.axes, []
+        for axis in axes:
+            turned = self._rotated(index, self._standing, Rotation.from_rotvec(_SMALL_TURN * axis))
+            before, after = (x - body.centre_of_mass(x) for x in (self._standing, turned))
+            turn = kabsch_rotation(body.node_mass, before, after)
+            turns.append(axes @ Rotation.from_matrix(turn).as_rotvec() / _SMALL_TURN)
+        return np.stack(turns, axis=1)
+
+    def _rotated(self, index: int, nodes: np.ndarray, turn: Rotation) -> np.ndarray:
+        """Return ``nodes`` (N, 3) with a part rotated about its joint."""
+        part, result = self.gesture.parts[index].nodes, nodes.copy()
+        joint = nodes[self._joints[index]].mean(axis=0)
+        result[part] = joint + turn.apply(nodes[part] - joint)
+        return result
+
+    def turn(self, time: float) -> np.ndarray:
+        """Return the rotation vector (3,) of the body that is due to the parts ``time`` seconds after the start of the
+        gesture, radians, ground axes."""
+        shares = zip(self._turned, self.gesture.channels, strict=True)
+        return np.sum([share @ np.radians(channel.at(time)[0]) for share, channel in shares], axis=0)
+
+    def pose(self, time: float, nodes: np.ndarray) -> np.ndarray:
+        """Return ``nodes`` (N, 3), ground coordinates, with the parts rotated as ``time`` seconds after the start of
+        the gesture."""
+        for index, (part, channel) in enumerate(zip(self.gesture.parts, self.gesture.channels, strict=True)):
+            if part.name != WHOLE_BODY:
+                heading = Rotation.from_rotvec([0.0, 0.0, self._headings[index]])
+                value = Rotation.from_rotvec(channel.at(time)[0], degrees=True)
+                nodes = self._rotated(index, nodes, heading * value * heading.inv())
+        return nodes
+
+    def outcome(self) -> GestureOutcome:
+        """Return the requested and the measured size."""
+        unit = "degrees" if self.gesture.channels[0].quantity is Quantity.ORIENTATION else "body heights"
+        reached = min(self._reached.values())
+        return GestureOutcome(self.gesture.name, self._size, reached, self.gesture.quantity, unit)
+
+    def measure(self, state: BodyState, elapsed: float) -> None:
+        """Measure the first channel ``elapsed`` seconds after the start of the motion."""
+        channel, time = self.gesture.channels[0], elapsed - self.begin
+        for k in self._extremes:
+            low, high = channel.times[max(k - 1, 0)], channel.times[min(k + 1, len(channel.times) - 1)]
+            if 0.5 * (low + channel.times[k]) <= time <= 0.5 * (channel.times[k] + high):
+                value = float(self._value(0, state) @ channel.values[k]) / self._size
+                self._reached[k] = max(self._reached[k], value)
+
+    def _value(self, index: int, state: BodyState) -> np.ndarray:
+        """Return the measured value (3,) of a channel."""
+        part, ground = self.gesture.parts[index], self._ground
+        if self.gesture.channels[index].quantity is Quantity.POSITION:
+            com, start = (self._body.centre_of_mass(x) for x in (state.positions, self._standing))
+            return ground.axes @ (com - start) / self._body.height
+        before, after = (x[part.nodes] - part.centre(x) for x in (self._standing, state.positions))
+        turn = kabsch_rotation(part.masses, before, after)
+        level = ground.rotation_about_up(self._headings[index])
+        return ground.axes @ Rotation.from_matrix(level.T @ turn).as_rotvec(degrees=True)
+
+    def posture(self, time: float) -> PostureTarget:
+        """Return the target posture of the whole body ``time`` seconds after the start of the gesture."""
+        height = self._body.height
+        target = PostureTarget(*np.zeros((4, 3)))
+        for part, channel in zip(self.gesture.parts, self.gesture.channels, strict=True):
+            if part.name != WHOLE_BODY:
+                continue
+            (value, rate), second = channel.at(time), channel.second_rate(time)
+            if channel.quantity is Quantity.POSITION:
+                target = PostureTarget(height * value, height * rate, height * second, target.turn)
+            else:
+                turn = target.turn + np.radians(value)
+                target = PostureTarget(target.offset, target.velocity, target.acceleration, turn)
+        return target
+
+    def at(self, name: str, elapsed: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the value (3,) and the rate (3,) of the part ``name``, ``elapsed`` seconds after the start of the
+        motion; None if the gesture does not move it."""
+        found = [channel for channel in self.gesture.channels if channel.part == name]
+        return found[0].at(elapsed - self.begin) if found else None
+
+    def objectives(self, state: BodyState, elapsed: float, dt: float, active: Sequence[_Layer]) -> list[AnyObjective]:
+        """Return the objectives of the parts for the step of ``dt`` seconds that starts ``elapsed`` seconds after the
+        motion. The values of ``active`` gestures of one part are added, and the first of them returns its objective."""
+        axes, rules, body = self._ground.axes, [], self._body
+        rate = _RATE * float(np.sqrt(np.linalg.norm(body.gravity) / body.height))
+        for index, part in enumerate(self.gesture.parts):
+            if part.name == WHOLE_BODY:
+                continue
+            before = self._headings[index]
+            heading = heading_between(self._standing, state.positions, self._shares[index], self._ground)
+            self._headings[index] = heading
+            turned = np.remainder(heading - before + np.pi, 2.0 * np.pi) - np.pi if self._has_started else 0.0
+            targets = {layer: layer.at(part.name, elapsed + dt) for layer in active}
+            moving = {layer: target for layer, target in targets.items() if target is not None}
+            if next(iter(moving)) is not self:
+                continue
+            value, value_rate = np.sum([*moving.values()], axis=0)
+            last = value - dt * value_rate
+            turning = np.radians(turn_between(last, value) / dt + rate * turn_between(self._value(index, state), last))
+            turning = turning + [0.0, 0.0, turned / dt]
+            ground = Coordinates(axes @ self._ground.rotation_about_up(heading).T, False)
+            rules.append(part_angular_velocity(body, part, state, turning, _WEIGHT, ground))
+        self._has_started = True
+        return rules
+
+
+class Act:
+    """Perform gestures while another motion runs below them, or while the body stands.
+
+    A gesture of the whole body replaces the upright posture of a standing body. Where gestures of one part overlap,
+    their values are added.
+    """
+
+    def __init__(
+        self, stance: Stance, gestures: Sequence[tuple[float, Gesture]], below: BodyMotion | None = None
+    ) -> None:
+        """Create the motion of the body that stands at ``stance``.
+
+        Args:
+            stance: stance at the start.
+            gestures: gestures with the seconds after which each starts.
+            below: motion that moves the rest of the body; None stands.
+
+        Raises:
+            UserError: for a gesture of the whole body on top of a motion other than standing.
+        """
+        self.below, self._stance = below, stance
+        self._layers = [_Layer(stance, gesture, begin) for begin, gesture in gestures]
+        whole = [gesture.name for _, gesture in gestures if gesture.moves_whole_body]
+        if below is not None and whole:
+            raise UserError(f"{whole[0]}: it moves the whole body, as the motion below does; give one after another")
+        self._end = max(layer.end for layer in self._layers)
+        self._stand: Stand | None = None
+        self._base: tuple[BodyPart, np.ndarray] | None = None
+        self._started: float | None = None
+        self._is_over = False
+        self._time_unit = float(np.sqrt(stance.body.height / np.linalg.norm(stance.body.gravity)))
+
+    @property
+    def is_at_rest(self) -> bool:
+        """True if the motion below and the gestures have ended and the body is at rest."""
+        if self.below is not None and not self.below.is_at_rest:
+            return False
+        return self._is_over and (self._stand is None or self._stand.is_at_rest)
+
+    @property
+    def expected_time(self) -> float:
+        """Expected duration in seconds until the body is at rest."""
+        return max(self._end + self._time_unit, self.below.expected_time if self.below is not None else 0.0)
+
+    def plan_record(self) -> DataclassInstance:
+        """Return the plan of the motion below; without one, the duration."""
+        return ActPlan(self._end) if self.below is None else self.below.plan_record()
+
+    def planned_com(self, elapsed: float) -> np.ndarray | None:
+        """Return the planned displacement of the motion below, or None."""
+        return None if self.below is None else self.below.planned_com(elapsed)
+
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> ActOutcome:
+        """Return the measured gestures, and what the motion below measures."""
+        below = None if self.below is None else self.below.outcome_record(trajectory, first, last)
+        return ActOutcome(tuple(layer.outcome() for layer in self._layers), below)
+
+    def notes(self) -> list[str]:
+        """Return the messages of the motion below."""
+        return [] if self.below is None else self.below.notes()
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
+        self._started = state.time if self._started is None else self._started
+        elapsed = state.time - self._started
+        active = [layer for layer in self._layers if layer.begin - 0.5 * dt <= elapsed < layer.end - 0.5 * dt]
+        self._is_over = elapsed >= self._end - 0.5 * dt
+        for layer in self._layers:
+            layer.measure(state, elapsed)
+        turn = np.sum([np.zeros(3), *(layer.turn(elapsed - layer.begin + dt) for layer in active)], axis=0)
+        if isinstance(self.below, Walk):
+            self.below.with_gestures = partial(self._with_gestures, active, elapsed + dt)
+        elif isinstance(self.below, Jump):
+            self.below.controller.gesture_turn = turn
+        if self.below is not None and not self.below.is_at_rest:
+            rules = list(self.below.objectives(state, report, dt))
+        else:
+            rules = self._standing(state, report, active, turn, elapsed, dt)
+        return [*rules, *(rule for layer in active for rule in layer.objectives(state, elapsed, dt, active))]
+
+    @staticmethod
+    def _with_gestures(active: Sequence[_Layer], elapsed: float, nodes: np.ndarray) -> np.ndarray:
+        for layer in active:
+            nodes = layer.pose(elapsed - layer.begin, nodes)
+        return nodes
+
+    def _standing(
+        self,
+        state: BodyState,
+        report: StepReport | None,
+        active: Sequence[_Layer],
+        turn: np.ndarray,
+        elapsed: float,
+        dt: float,
+    ) -> list[AnyObjective]:
+        if self._stand is None:
+            stance = self._stance if self.below is None else self._stance.next_stance(state.positions, report)
+            self._stand = Stand(stance)
+            heights = (stance.standing - stance.ground.origin) @ stance.ground.surface_normal
+            base = BodyPart.base(stance.body, heights)
+            self._base = base, stance.standing[base.nodes]
+        postures = [layer.posture(elapsed - layer.begin + dt) for layer in active if layer.gesture.moves_whole_body]
+        self._stand.posture = sum_postures(postures) if postures else None
+        self._stand.controller.gesture_turn = turn
+        rules = self._stand.objectives(state, report, dt)
+        if not active or self._base is None:
+            return rules
+        base, places = self._base
+        speed = _RATE / self._time_unit * (places - state.positions[base.nodes])
+        return [*rules, part_nodes(self._stance.body, base, speed, _BASE_WEIGHT)]
+
+
+def sum_postures(postures: Sequence[PostureTarget]) -> PostureTarget:
+    """Return the sum of postures, for small rotations."""
+    fields = ("offset", "velocity", "acceleration", "turn")
+    return PostureTarget(*(sum((getattr(one, field) for one in postures), np.zeros(3)) for field in fields))

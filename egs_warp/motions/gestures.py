@@ -1,0 +1,266 @@
+"""Gestures: movements of the head, of a branch or of the whole body over the feet, as curves of target values.
+
+Times are in sqrt(H / g) from the start of the gesture. See docs/motions/gestures.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.locomotion.objectives import BodyPart
+from egs_warp.motions.feet import SupportKind
+from egs_warp.motions.follow import parts_of_body
+from egs_warp.motions.keyframes import Channel, Quantity
+from egs_warp.motions.sequence import Stance
+
+WHOLE_BODY = "body"
+"""Part whose position is that of the centre of mass over the feet, and whose orientation is that of the body as a
+whole; only a standing body can move it."""
+TOLERANCES = {"degrees": (3.0, 0.2), "body heights": (0.01, 0.2)}
+"""Largest error of a gesture, in its unit and as a fraction of what was requested; the larger one counts."""
+_BOW_LEAN, _LEAN_LIMITS = 0.6, (0.2, 0.4)
+"""Lean of a bowing body relative to the angle of its head, less the head's share of the mass, and its limits: what a
+heavy head adds to the rotation of the body, the rest need not lean."""
+_HEAD_TILT = 250.0
+"""Tilt of the head in a groove, degrees per body height of sway."""
+_WATCH_ANGLE, _WATCH_PITCH = 12.0, 1.0
+"""Rotation of the head of a sneaking body, degrees, and its part forward and down relative to that to the side."""
+_MAX_HEAD_MASS = 0.6
+"""Largest mass of a head relative to that of the body."""
+_SAME_HEIGHT = 0.1
+"""Difference in height, in body heights, up to which two branches are equally high; of these, the right one waves."""
+_STEEP = 0.8
+"""Upward component of the direction of a branch from which on it swings sideways instead of up."""
+
+
+@dataclass(frozen=True)
+class Gesture:
+    """Curves of target values of parts of a body."""
+
+    name: str
+    parts: tuple[BodyPart, ...]
+    """Part of each channel."""
+    channels: tuple[Channel, ...]
+    """Orientations in degrees and positions in body heights; times in seconds from the start of the gesture. The first
+    channel is measured against its largest value."""
+    quantity: str = "angle"
+    """Quantity that the first channel sets, for messages."""
+
+    @property
+    def duration(self) -> float:
+        """Time of the last key, s."""
+        return max(float(channel.times[-1]) for channel in self.channels)
+
+    @property
+    def moves_whole_body(self) -> bool:
+        """True if the gesture needs a body that stands."""
+        return any(part.name == WHOLE_BODY for part in self.parts)
+
+
+@dataclass(frozen=True)
+class GestureOutcome:
+    """Requested and measured size of one gesture."""
+
+    name: str
+    requested: float
+    """Largest value of the curve."""
+    reached: float
+    """Smallest of the largest values that were measured around the keys with the value ``requested``."""
+    quantity: str
+    """Quantity of ``requested`` and ``reached``, such as ``angle``."""
+    unit: str
+    """``degrees`` or ``body heights``."""
+
+    @property
+    def text(self) -> str:
+        """Reached and requested size."""
+        return f"{self.name} {self.quantity} {self.reached:.2g} of {self.requested:.2g} {self.unit}"
+
+    @property
+    def is_missed(self) -> bool:
+        """True if the gesture is smaller or larger than requested by more than ``TOLERANCES``."""
+        absolute, relative = TOLERANCES[self.unit]
+        return abs(self.reached - self.requested) > max(absolute, relative * self.requested)
+
+
+class _Builder:
+    """Builder of the curves of one gesture of a body that stands at ``stance``."""
+
+    def __init__(self, name: str, stance: Stance) -> None:
+        self.name, self.stance = name, stance
+        gravity = float(np.linalg.norm(stance.body.gravity))
+        self._time_unit = float(np.sqrt(stance.body.height / gravity))
+        self._parts: list[BodyPart] = []
+        self._channels: list[Channel] = []
+
+    def add(
+        self,
+        part: BodyPart,
+        quantity: Quantity,
+        times: Sequence[float],
+        values: Sequence[Sequence[float]],
+        *,
+        start: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Add a channel through ``values`` at ``times`` (sqrt(H / g)), from ``start`` at time 0."""
+        self._parts.append(part)
+        self._channels.append(
+            Channel(
+                part.name,
+                quantity,
+                self._time_unit * np.array([0.0, *times]),
+                np.array([start, *values], dtype=float),
+                np.ones(len(times)),
+            )
+        )
+
+    def turn(self, part: BodyPart, axis: Sequence[float], times: Sequence[float], degrees: Sequence[float]) -> None:
+        """Add a channel that rotates ``part`` about ``axis`` (3,), forward, left and up, by ``degrees``."""
+        self.add(part, Quantity.ORIENTATION, times, [tuple(value * x for x in axis) for value in degrees])
+
+    def beats(self, seconds: float) -> float:
+        """Return ``seconds`` in sqrt(H / g)."""
+        return seconds / self._time_unit
+
+    def gesture(self, quantity: str = "angle") -> Gesture:
+        """Return the gesture, whose first channel sets ``quantity``."""
+        return Gesture(self.name, tuple(self._parts), tuple(self._channels), quantity)
+
+    def head(self) -> BodyPart:
+        """Return the head, or the top of a body of which the part above the neck is most.
+
+        Raises:
+            UserError: for a body that lies along the ground or rolls.
+        """
+        self.check_upright("no head above the rest")
+        body, local = self.stance.body, self.stance.ground.local(self.stance.standing)
+        head = next(part for part in parts_of_body(self.stance) if part.name == "head")
+        is_head = head.masses.sum() <= _MAX_HEAD_MASS * body.mass
+        return head if is_head else BodyPart.head(body, local[:, 2])
+
+    def check_upright(self, missing: str) -> None:
+        """Raise ``UserError`` for a body without an upright pose; ``missing`` says what it does not have."""
+        kind = self.stance.base()
+        if kind in (SupportKind.LYING, SupportKind.ROUND_BASE):
+            raise UserError(f"{self.name}: the body stands on {kind.value} and has {missing}; walk or jump")
+
+    def whole(self) -> BodyPart:
+        """Return the whole body."""
+        return BodyPart.whole(self.stance.body)
+
+
+def nod(stance: Stance, values: Mapping[str, float]) -> Gesture:
+    """Return a nod: the head moves up a little, then forward and down ``count`` times."""
+    built, count, size = _Builder("nod", stance), int(values["count"]), values["degrees"]
+    times = [0.6, *(1.5 + 1.9 * k + shift for k in range(count) for shift in (0.0, 0.95))]
+    degrees = [-0.2 * size, *(factor * size for _ in range(count) for factor in (1.0, -0.1))]
+    degrees[-1] = 0.0
+    times[-1] += 0.4
+    built.turn(built.head(), (0.0, 1.0, 0.0), times, degrees)
+    return built.gesture()
+
+
+def shake(stance: Stance, values: Mapping[str, float]) -> Gesture:
+    """Return a shake of the head: to the left and to the right, ``count`` times."""
+    built, count, size = _Builder("shake", stance), int(values["count"]), values["degrees"]
+    times = [0.9 + 1.1 * k for k in range(2 * count)]
+    degrees = [size * (-1.0) ** k for k in range(2 * count)]
+    built.turn(built.head(), (0.0, 0.0, 1.0), [*times, times[-1] + 1.2], [*degrees, 0.0])
+    return built.gesture()
+
+
+def look_around(stance: Stance, values: Mapping[str, float]) -> Gesture:
+    """Return a look to the left and to the right: each turn dips in the middle and is held at its end."""
+    built, size = _Builder("look around", stance), values["degrees"]
+    head = built.head()
+    left, right = np.array([0.0, -0.15, 1.0]) * size, np.array([0.0, -0.15, -1.0]) * size
+    dip = np.array([0.0, 0.2, 0.0]) * size
+    times = [0.7, 1.6, 3.6, 4.6, 5.6, 7.6, 9.0]
+    keys = [0.4 * left + 0.5 * dip, left, left, dip, right, right, np.zeros(3)]
+    built.add(head, Quantity.ORIENTATION, times, [tuple(key) for key in keys])
+    return built.gesture()
+
+
+def bow(stance: Stance, values: Mapping[str, float]) -> Gesture:
+    """Return a bow: the head leads, the body leans after it, and both come up in the opposite order."""
+    built, size = _Builder("bow", stance), values["degrees"]
+    head = built.head()
+    built.turn(head, (0.0, 1.0, 0.0), [0.5, 2.4, 4.6, 7.4], [-0.1 * size, size, size, 0.0])
+    lean = size * float(np.clip(_BOW_LEAN - head.masses.sum() / stance.body.mass, *_LEAN_LIMITS))
+    built.turn(built.whole(), (0.0, 1.0, 0.0), [0.8, 2.8, 4.4, 6.8], [0.0, lean, lean, 0.0])
+    return built.gesture()
+
+
+def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
+    """Return a wave: a branch is raised and swings ``count`` times.
+
+    Raises:
+        UserError: for a body without a branch, or without that of the given number.
+    """
+    built, count, size = _Builder("wave", stance), int(values["count"]), values["degrees"]
+    branches = [part for part in parts_of_body(stance) if part.name.startswith("branch ")]
+    if not branches:
+        raise UserError("wave: the body has no branch that is free, such as an arm, a tail or an ear; nod or bow")
+    number = int(values["branch"])
+    if number > len(branches):
+        raise UserError(f"wave: the body has no branch {number}; it has {', '.join(part.name for part in branches)}")
+    local = stance.ground.local(stance.standing)
+    centres = np.array([part.centre(local) for part in branches]) / stance.body.height
+    is_high = centres[:, 2] > centres[:, 2].max() - _SAME_HEIGHT
+    branch = branches[number - 1 if number else int(np.argmin(np.where(is_high, centres[:, 1], np.inf)))]
+    ahead, left, up = branch.centre(local) - stance.body.centre_of_mass(local)
+    length = float(np.hypot(ahead, left))
+    axis = (left / length, -ahead / length, 0.0) if up < _STEEP * np.hypot(length, up) else (1.0, 0.0, 0.0)
+    times = [1.4 + 0.8 * k for k in range(2 * count)]
+    degrees = [size * (0.2 if k % 2 else 1.0) for k in range(2 * count)]
+    built.turn(branch, axis, [*times[:-1], times[-1] + 0.6], [*degrees[:-1], 0.0])
+    return built.gesture()
+
+
+def groove(stance: Stance, values: Mapping[str, float]) -> Gesture:
+    """Return a dance on the spot that ends as it begins: the body sways from side to side on the beats and dips between
+    them, and the head tilts against it."""
+    built, count, sway = _Builder("groove", stance), int(values["beats"]), values["sway"]
+    built.check_upright("no feet to sway over")
+    beat = built.beats(60.0 / values["tempo"])
+    sides = [0.0 if k + 1 == count else (-1.0) ** k for k in range(count)]
+    times, positions, tilts = [], [], []
+    before = 0.0
+    for k, side in enumerate(sides):
+        times += [(k + 0.5) * beat, (k + 1.0) * beat]
+        positions += [(0.0, 0.5 * (before + side) * sway, -0.9 * sway), (0.0, side * sway, 0.0)]
+        tilts += [0.5 * (before + side), side]
+        before = side
+    built.add(built.whole(), Quantity.POSITION, times, positions)
+    late = [time + 0.15 * beat for time in times]
+    built.turn(built.head(), (1.0, 0.0, 0.0), late, [_HEAD_TILT * sway * tilt for tilt in tilts])
+    return built.gesture("sway")
+
+
+def watch(stance: Stance, seconds: float) -> Gesture:
+    """Return the looks to both sides of a body that sneaks for ``seconds``, its head held low."""
+    built = _Builder("watch", stance)
+    length = built.beats(seconds)
+    low, left, right = (np.array([0.0, _WATCH_PITCH, side]) for side in (0.0, 1.0, -1.0))
+    times = [0.12, 0.24, 0.4, 0.55, 0.72, 0.85, 1.0]
+    keys = [low, left, left, right, right, low, np.zeros(3)]
+    size = _WATCH_ANGLE / float(np.linalg.norm(left))
+    built.add(
+        built.head(), Quantity.ORIENTATION, [length * time for time in times], [tuple(size * key) for key in keys]
+    )
+    return built.gesture()
+
+
+def landed_pose(stance: Stance, depth: float, seconds: float) -> Gesture:
+    """Return a pose that holds a crouch by ``depth`` (m), in which the body has landed, for ``seconds``: the head rises
+    and looks ahead, and the body stands up."""
+    built = _Builder("pose", stance)
+    low = (0.0, 0.0, -depth / stance.body.height)
+    hold = max(built.beats(seconds), 1.0)
+    built.add(built.whole(), Quantity.POSITION, [hold, hold + 2.5], [low, (0.0, 0.0, 0.0)], start=low)
+    built.turn(built.head(), (0.0, 1.0, 0.0), [0.5 * hold, hold, hold + 2.0], [-20.0, -20.0, 0.0])
+    return built.gesture("depth")

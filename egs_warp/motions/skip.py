@@ -1,0 +1,122 @@
+"""Skip: small jumps in quick succession, each turned to the other side (docs/motions/gestures.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import heading_between, sole_shares
+from egs_warp.motions.turn import MAX_TURN_FRACTION, largest_turn
+from egs_warp.motions.twist import TurnHeading
+
+_MAX_LENGTH = 0.3
+"""Largest length of one jump, in body heights."""
+_TURN = np.radians(12.0)
+"""Angle in radians by which the body is turned to either side of its direction."""
+_MIN_CONTACT_TIME, _MAX_MARGIN = 0.3, 0.5
+"""A landed body jumps again after the first, in sqrt(H / g), if its capture point is nearer to the middle of its feet
+than the second, relative to their edge."""
+
+
+@dataclass(frozen=True)
+class SkipPlan:
+    """Planned quantities of a skip; metres."""
+
+    jumps: float
+    length: float
+    """Length of one jump."""
+    height: float
+    """Height of one jump."""
+    turn_degrees: float
+    """Angle by which the body is turned to either side."""
+
+
+class Skip:
+    """Jump ahead in short, low jumps; each starts as soon as the body is balanced after the previous one."""
+
+    def __init__(self, stance: Stance, distance: float, height: float) -> None:
+        """Create the motion of the body that stands at ``stance``.
+
+        Args:
+            stance: stance at the start.
+            distance: distance ahead, m.
+            height: height of one jump, m.
+        """
+        body = stance.body
+        self._start, self._height = stance, height
+        self._count = max(2, int(np.ceil(distance / (_MAX_LENGTH * body.height) - 1e-9)))
+        self._length = distance / self._count
+        self._share = sole_shares(body, stance.ground, stance.standing)
+        self._time_unit = float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
+        straight = Jump(stance, JumpTarget(self._length, height))
+        self._turn = min(_TURN, 0.5 * MAX_TURN_FRACTION * largest_turn(straight, stance))
+        self._landed: float | None = None
+        self.jumps = [self._next(stance, stance.standing, 1)]
+
+    @property
+    def expected_time(self) -> float:
+        """Expected duration in seconds until the body is at rest."""
+        plan = self.jumps[0].plan
+        once = plan.crouch_time + plan.thrust_time + plan.flight_time + 2.0 * _MIN_CONTACT_TIME * self._time_unit
+        return self.jumps[0].expected_time + (self._count - 1) * once
+
+    @property
+    def is_at_rest(self) -> bool:
+        """True if the body is at rest after the last jump."""
+        return len(self.jumps) == self._count and self.jumps[-1].is_at_rest
+
+    def plan_record(self) -> SkipPlan:
+        """Return the planned quantities of the motion."""
+        return SkipPlan(float(self._count), self._length, self._height, float(np.degrees(self._turn)))
+
+    def planned_com(self, elapsed: float) -> None:
+        """Return None: each jump starts from the measured landing of the previous one."""
+
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> None:
+        """Return None: a skip has no quantities of its own beyond those measured for all motions."""
+
+    def notes(self) -> list[str]:
+        """Return messages for the user about phases that took too long."""
+        return [note for jump in self.jumps for note in jump.notes()]
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
+        jump = self.jumps[-1]
+        result = jump.objectives(state, report, dt)
+        if jump.phase not in (JumpPhase.LAND, JumpPhase.REST):
+            self._landed = None
+            return result
+        self._landed = state.time if self._landed is None else self._landed
+        if len(self.jumps) < self._count and self._is_balanced(jump, state, report):
+            stance = self._start.moved_to(state.positions)
+            self.jumps.append(self._next(stance, state.positions, len(self.jumps) + 1))
+            return self.jumps[-1].objectives(state, report, dt)
+        return result
+
+    def _is_balanced(self, jump: Jump, state: BodyState, report: StepReport | None) -> bool:
+        if jump.is_at_rest:
+            return True
+        assert self._landed is not None
+        measurement = jump.controller.measure(state, report)
+        margin = jump.controller.capture_margin(measurement)
+        return state.time - self._landed >= _MIN_CONTACT_TIME * self._time_unit and margin <= _MAX_MARGIN
+
+    def _next(self, stance: Stance, positions: np.ndarray, number: int) -> Jump:
+        """Return jump ``number``, counted from 1, from ``stance``, with the nodes at ``positions`` (N, 3)."""
+        start = self._start
+        goal = self._share @ start.standing + number * self._length * start.ground.axes[0]
+        offset = goal - self._share @ positions
+        target = JumpTarget(float(np.linalg.norm(start.ground.axes[:2] @ offset)), self._height)
+        turned = heading_between(start.standing, positions, self._share, start.ground)
+        side = 0.0 if number == self._count else self._turn * (-1.0) ** number
+        facing = TurnHeading(stance, side - turned)
+        return Jump(stance.with_forward(offset), target, facing=facing, skips_settling=number > 1)

@@ -1,0 +1,35 @@
+"""The built-in bear looks around, nods, bows, sways and lands in a pose: video, contact sheet, report, trajectory."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import egs_warp as egs
+
+
+def main(arguments: list[str] | None = None) -> egs.Report:
+    """Run the example and return the report."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/acting"))
+    parser.add_argument(
+        "--motion", default="look around + nod at=2.2, bow, groove beats=4, land and pose", help="motions of the bear"
+    )
+    parser.add_argument("--frames", type=int, help="number of frames (default: until the body is at rest)")
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--device", default="cpu")
+    chosen = parser.parse_args(arguments)
+    egs.use_device(chosen.device)
+    built_in = egs.scene("figurine", device=chosen.device)
+    options = egs.AnimateOptions(frames=chosen.frames, size=chosen.size, source="figurine")
+    report = egs.animate(
+        built_in.object, chosen.out, motion=chosen.motion, plane=built_in.plane, options=options, overwrite=True
+    )
+    print(report.summary())
+    print(f"wrote the video, sheet.png, plots.png, report.json and trajectory.npz to {chosen.out}")
+    return report
+
+
+if __name__ == "__main__":
+    with egs.one_line_errors("acting.py"):
+        main()

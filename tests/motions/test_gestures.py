@@ -1,0 +1,129 @@
+"""Gestures: the curves of the motions that act, and the bodies that cannot do them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.locomotion.objectives import BodyPart
+from egs_warp.motions.acting import ACTING
+from egs_warp.motions.gestures import WHOLE_BODY, Gesture, GestureOutcome, bow, groove, nod, wave
+from egs_warp.motions.keyframes import Quantity
+from egs_warp.motions.sequence import Stance
+from tests.support.meshes import ball_mesh, block_mesh, figure
+from tests.support.stances import standing_stance
+
+
+@pytest.fixture(scope="module")
+def person() -> Stance:
+    """Return the stance of a figure with a head and two extended arms; forward is +y, left is -x."""
+    return standing_stance(figure())
+
+
+def defaults(name: str) -> dict[str, float]:
+    return {value.name: value.default for value in ACTING[name].parameters}
+
+
+def built(name: str, stance: Stance, **values: float) -> Gesture:
+    gesture = ACTING[name].gesture
+    assert gesture is not None
+    return gesture(stance, defaults(name) | values)
+
+
+GESTURES = [name for name, kind in ACTING.items() if kind.gesture is not None]
+
+
+@pytest.mark.parametrize("name", GESTURES)
+def test_each_gesture_starts_and_ends_at_zero_and_reaches_its_size(name: str, person: Stance) -> None:
+    gesture = built(name, person)
+    for channel in gesture.channels:
+        assert np.allclose(channel.values[[0, -1]], 0.0), channel.part
+        assert (np.diff(channel.times) > 0.0).all()
+    size = defaults(name)["sway" if name == "groove" else "degrees"]
+    along = np.abs(gesture.channels[0].values).max()
+    assert along == pytest.approx(size) or name == "wave"
+    assert gesture.duration == max(channel.times[-1] for channel in gesture.channels)
+    assert gesture.moves_whole_body == (name in ("bow", "groove"))
+
+
+def test_a_nod_has_as_many_dips_as_requested(person: Stance) -> None:
+    """Positive rotations about the left axis move the head forward and down."""
+    (channel,) = nod(person, {"degrees": 20.0, "count": 3.0}).channels
+    assert channel.part == "head" and channel.quantity is Quantity.ORIENTATION
+    assert np.count_nonzero(channel.values[:, 1] == 20.0) == 3
+    assert np.allclose(channel.values[:, [0, 2]], 0.0)
+
+
+def test_a_wave_raises_the_tip_of_the_right_branch(person: Stance) -> None:
+    """The arms are equally high: the right one waves, and a small rotation of the curve moves its tip up."""
+    gesture = wave(person, defaults("wave"))
+    (part,), (channel,) = gesture.parts, gesture.channels
+    local = person.ground.local(person.standing)
+    arm = part.centre(local) - person.body.centre_of_mass(local)
+    assert part.name.startswith("branch ") and arm[1] < 0.0
+    axis = channel.values[1] / np.linalg.norm(channel.values[1])
+    assert np.cross(axis, arm)[2] > 0.9 * np.linalg.norm(arm[:2])
+    sizes = np.linalg.norm(channel.values, axis=1)
+    assert np.count_nonzero(sizes > 0.99 * 45.0) == 3
+    left = wave(person, {**defaults("wave"), "branch": 3.0 - float(part.name.split()[1])})
+    assert left.parts[0].name != part.name
+
+
+def test_a_groove_is_on_the_beats_and_to_both_sides(person: Stance) -> None:
+    gesture = groove(person, {"tempo": 120.0, "beats": 4.0, "sway": 0.05})
+    body, head = gesture.channels
+    assert body.part == WHOLE_BODY and body.quantity is Quantity.POSITION
+    assert np.allclose(body.times[::2], [0.0, 0.5, 1.0, 1.5, 2.0])
+    assert np.allclose(body.values[::2, 1], [0.0, 0.05, -0.05, 0.05, 0.0])
+    assert (body.values[1::2, 2] < 0.0).all(), "it dips between the beats"
+    assert head.part == "head" and (head.times[1:] > body.times[1:]).all(), "the head follows"
+
+
+def test_a_heavy_head_leans_the_body_less(person: Stance) -> None:
+    """The head of a bow is the part above the neck; one that is most of the body is replaced by its top."""
+    head, whole = bow(person, {"degrees": 30.0}).channels
+    assert head.part == "head" and whole.part == WHOLE_BODY
+    assert 0.2 * 30.0 <= whole.values[:, 1].max() <= 0.4 * 30.0
+
+
+def test_a_part_above_the_neck_that_is_most_of_the_body_is_no_head(
+    person: Stance, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    most = BodyPart.of(person.body, "head", np.flatnonzero(person.ground.local(person.standing)[:, 2] > 0.2))
+    monkeypatch.setattr("egs_warp.motions.gestures.parts_of_body", lambda stance: [most])
+    (part,) = nod(person, defaults("nod")).parts
+    assert part.name == "head" and len(part.nodes) < len(most.nodes)
+    assert part.masses.sum() < 0.5 * most.masses.sum()
+
+
+def test_a_body_that_cannot_do_a_gesture_is_told_what_is_missing(person: Stance) -> None:
+    block, ball = standing_stance(block_mesh()), standing_stance(ball_mesh())
+    with pytest.raises(UserError) as error:
+        wave(block, defaults("wave"))
+    assert str(error.value) == "wave: the body has no branch that is free, such as an arm, a tail or an ear; nod or bow"
+    with pytest.raises(UserError, match=r"^wave: the body has no branch 7; it has branch 1, branch 2$"):
+        wave(person, {**defaults("wave"), "branch": 7.0})
+    with pytest.raises(UserError, match=r"^nod: the body stands on a round base and has no head above the rest; walk"):
+        nod(ball, defaults("nod"))
+    with pytest.raises(UserError, match=r"^groove: the body stands on a round base and has no feet to sway over"):
+        groove(ball, defaults("groove"))
+
+
+@pytest.mark.parametrize(
+    ("requested", "reached", "unit", "missed"),
+    [
+        (20.0, 17.1, "degrees", False),
+        (20.0, 15.9, "degrees", True),
+        (5.0, 2.1, "degrees", False),
+        (20.0, 24.1, "degrees", True),
+        (0.04, 0.031, "body heights", False),
+        (0.1, 0.079, "body heights", True),
+    ],
+)
+def test_a_gesture_is_missed_by_a_fifth_or_a_small_amount(
+    requested: float, reached: float, unit: str, missed: bool
+) -> None:
+    outcome = GestureOutcome("nod", requested, reached, "angle", unit)
+    assert outcome.is_missed == missed
+    assert outcome.text.startswith("nod angle ") and outcome.text.endswith(f" {unit}")
