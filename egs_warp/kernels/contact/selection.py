@@ -26,6 +26,7 @@ def lowest_of_block(order: wp.array[int], height: real, first: real):
     if height > lowest_height:
         first = real(wp.inf)
     first = -block_max(-first)
+    sync_block()
     if first < real(wp.inf):
         return order[int(first)]
     return int(-1)
