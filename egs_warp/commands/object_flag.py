@@ -25,7 +25,7 @@ from egs_warp.segmentation.votes import MaskedView
 MAX_MASK_SIDE = 800
 """Maximum side of a mask, pixels; larger masks are reduced to a half, a third, ... of their size."""
 _HELP = (
-    "give a picked.json, a mask.png, a folder of masks, a point x,y,z, a box x0,y0,z0,x1,y1,z1, a pixel u,v with "
+    "give a mask.png, a folder of masks, a picked.json, a point x,y,z, a box x0,y0,z0,x1,y1,z1, a pixel u,v with "
     "--view, or clicks +u,v@photo on the object and -u,v@photo next to it"
 )
 _MAX_DIGITS = 10

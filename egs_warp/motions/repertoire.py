@@ -248,6 +248,7 @@ def _acting_kind(kind: ActingKind) -> MotionKind:
         ),
         lambda request: int(np.ceil(kind.frames(request.asked))),
         jumps=kind.jumps,
+        retakes=_JUMP_RETAKES if kind.jumps else (),
         gesture=kind.gesture,
     )
 

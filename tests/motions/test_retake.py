@@ -57,12 +57,19 @@ def test_walks_take_shorter_steps_to_the_same_place(text: str, place: Stance) ->
 
 
 def test_other_motions_have_no_retake() -> None:
-    """Standing, getting up, and motions under commands, beats or key frames are as gentle as they are requested."""
+    """Standing, getting up, gestures, and motions under commands, beats or key frames are as gentle as requested."""
     assert [name for name, kind in MOTIONS.items() if not kind.retakes] == [
         "drive",
         "stand",
         "get up",
         "dance",
         "trajectory",
+        "nod",
+        "shake",
+        "look around",
+        "wave",
+        "bow",
+        "groove",
+        "sneak",
     ]
     assert motion("stand 1, jump").retake(0) is None

@@ -165,7 +165,7 @@ def test_the_command_leaves_a_core_to_the_page_while_it_serves(
     monkeypatch.delenv(THREADS, raising=False)
     monkeypatch.setattr("egs_warp.commands.live._session", lambda *_, **__: session_of(coarse_pawn(), tmp_path))
     monkeypatch.setattr(
-        "egs_warp.commands.live._wait", lambda thread: used.append((thread.is_alive(), available_threads()))
+        "egs_warp.commands.live.wait_for_end", lambda thread: used.append((thread.is_alive(), available_threads()))
     )
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=2000).cloud)
     assert main(["live", str(tmp_path / "pawn.ply"), "--up", "z", "--no-browser"]) == 0
