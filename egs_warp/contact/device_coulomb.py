@@ -70,20 +70,9 @@ class CoulombWorkspace:
             forces: (3K,) newtons, initial forces; overwritten with the solution.
             violation: (1,) m/s, overwritten with the residual of Coulomb's law.
         """
-        lanes = kernels.BLOCK if speeds.is_cuda else 1
-        launch_on(
-            speeds.device,
-            kernels.coulomb_kernel,
-            (1, lanes),
-            inputs=[
-                (self.counts, wp.int32),
-                *((each, real) for each in (self._regular[None], speeds[None], self.normal_bias[None], self.friction)),
-                *(TOLERANCE, MAX_ITERATIONS, (forces[None], real), (self._vectors, real)),
-                *((self._indices, wp.int32), (self._matrices, Vec4)),
-            ],
-            outputs=[(violation, real)],
-            block_dim=lanes,
-        )
+        scratch = self._vectors, self._indices, self._matrices
+        values = self._regular[None], speeds[None], self.normal_bias[None], self.friction
+        _enqueue(self.counts, values, forces[None], scratch, violation)
 
 
 def coulomb_forces_batch(
@@ -141,19 +130,39 @@ def _solve(
     vectors = start.new_empty((worlds, 5, size))
     indices = torch.empty((worlds, 2, size), dtype=torch.int32, device=start.device)
     matrices = start.new_empty((worlds, size, (size + 4) // 4, 4))
-    lanes = kernels.BLOCK if start.is_cuda else 1
-    values = delassus, free_velocity, shift, frictions
+    values = tuple(each.contiguous() for each in (delassus, free_velocity, shift, frictions))
+    _enqueue(counts, values, forces.view(worlds, size), (vectors, indices, matrices), residual)
+    return forces, residual
+
+
+def _enqueue(
+    counts: torch.Tensor,
+    values: tuple[torch.Tensor, ...],
+    forces: torch.Tensor,
+    scratch: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    residual: torch.Tensor,
+) -> None:
+    """Queue the kernel for c worlds with contiguous arrays.
+
+    Args:
+        counts: (c,) int32, number of contacts of each world.
+        values: operators (c, 3K, 3K) m/(N s), contact velocities without contact forces (c, 3K) m/s, biases (c, K) m/s
+            and Coulomb coefficients (c,).
+        forces: (c, 3K) newtons, initial forces; overwritten with the solution.
+        scratch: (c, 5, 3K), (c, 2, 3K) int32 and (c, 3K, ceil((3K + 1) / 4), 4).
+        residual: (c,) m/s, overwritten with the residual of Coulomb's law.
+    """
+    vectors, indices, matrices = scratch
+    lanes = kernels.BLOCK if forces.is_cuda else 1
     launch_on(
-        start.device,
+        forces.device,
         kernels.coulomb_kernel,
-        (worlds, lanes),
+        (len(forces), lanes),
         inputs=[
             (counts, wp.int32),
-            *((each.contiguous(), real) for each in values),
-            *(TOLERANCE, MAX_ITERATIONS),
-            *((forces.view(worlds, size), real), (vectors, real), (indices, wp.int32), (matrices, Vec4)),
+            *((each, real) for each in values),
+            *(TOLERANCE, MAX_ITERATIONS, (forces, real), (vectors, real), (indices, wp.int32), (matrices, Vec4)),
         ],
         outputs=[(residual, real)],
         block_dim=lanes,
     )
-    return forces, residual
