@@ -31,12 +31,15 @@ from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from egs_warp.commands.scene_input import SceneInput
+    from egs_warp.geometry.gaussians import GaussianCloud
+    from egs_warp.geometry.plane import Plane
     from egs_warp.io.run_folder import RunFolder
     from egs_warp.pipelines.animate import AnimateOptions
     from egs_warp.pipelines.prepare_scene import PreparedScene
     from egs_warp.pipelines.report import Report
-
 
 EXIT_NOT_AS_REQUESTED = 3
 """Exit status of a run that has written its files, but is not what was requested (``State.is_failure``)."""
@@ -219,9 +222,7 @@ def _animate_capture(args: argparse.Namespace) -> Report:
     """Animate a capture that contains only the object."""
     from egs_warp.commands.scene_input import ground_of, plane_of
     from egs_warp.io import read_capture
-    from egs_warp.io.run_folder import run_folder
     from egs_warp.io.video import ffmpeg_program
-    from egs_warp.pipelines.animate import animate
 
     check_no_scene_flags(args)
     options = _options(args)
@@ -239,28 +240,14 @@ def _animate_capture(args: argparse.Namespace) -> Report:
     if plane is None and up is None:
         up, note = guessed_up(capture)
         notes = (*notes, note)
-    for note in notes:
-        print_note(note)
-    with run_folder(args.out, overwrite=args.overwrite, resume=args.resume) as run:
-        run.begin_with(lambda: write_config(run.file(NAME), args, args.parser))
-        report = animate(
-            capture.cloud,
-            run,
-            motion=args.motion,
-            up=up,
-            plane=plane,
-            background=background,
-            options=replace(
-                options,
-                shot=shot,
-                view_from=view_from,
-                notes=notes,
-                creature=replace(options.creature, ground=ground_of(args.plane, flat=args.flat)),
-            ),
-            show_note=print_note,
-        )
-        run.finish()
-    return report
+    options = replace(
+        options,
+        shot=shot,
+        view_from=view_from,
+        notes=notes,
+        creature=replace(options.creature, ground=ground_of(args.plane, flat=args.flat)),
+    )
+    return _animate_whole(args, capture.cloud, options, up=up, plane=plane, background=background)
 
 
 def _animate_scene(args: argparse.Namespace) -> Report:
@@ -286,7 +273,8 @@ def _animate_scene(args: argparse.Namespace) -> Report:
     front = options.creature.front if options.creature.front is not None else scene_input.front
     options = replace(options, shot=shot, creature=replace(options.creature, front=front))
     if scene_input.is_object_alone:
-        return _animate_whole(args, scene_input, replace(options, view_from=view_from, notes=scene_input.notes))
+        options = replace(options, view_from=view_from, notes=scene_input.notes)
+        return _animate_whole(args, scene_input.cloud, options, up=scene_input.up, plane=scene_input.plane)
     scene_options = SceneOptions(
         clearing=clearing_of(args), flat=args.flat, inpaint=not args.no_inpaint, inpainter=inpainter
     )
@@ -320,21 +308,30 @@ def _animate_scene(args: argparse.Namespace) -> Report:
     return report
 
 
-def _animate_whole(args: argparse.Namespace, scene_input: SceneInput, options: AnimateOptions) -> Report:
-    """Animate a picked object that is the whole capture; see ``_animate_capture``."""
+def _animate_whole(
+    args: argparse.Namespace,
+    cloud: GaussianCloud,
+    options: AnimateOptions,
+    *,
+    up: np.ndarray | None,
+    plane: Plane | None,
+    background: GaussianCloud | None = None,
+) -> Report:
+    """Animate ``cloud``, which is one object; see ``_animate_capture``."""
     from egs_warp.io.run_folder import run_folder
     from egs_warp.pipelines.animate import animate
 
-    for note in scene_input.notes:
+    for note in options.notes:
         print_note(note)
     with run_folder(args.out, overwrite=args.overwrite, resume=args.resume) as run:
         run.begin_with(lambda: write_config(run.file(NAME), args, args.parser))
         report = animate(
-            scene_input.cloud,
+            cloud,
             run,
             motion=args.motion,
-            up=scene_input.up,
-            plane=scene_input.plane,
+            up=up,
+            plane=plane,
+            background=background,
             options=options,
             show_note=print_note,
         )
