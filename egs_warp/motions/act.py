@@ -34,8 +34,6 @@ _RATE = 6.0
 """Rate in sqrt(g / H) at which an error of an orientation is corrected."""
 _BASE_WEIGHT = 5.0
 """Weight of the velocity of the base, which stays where it is while the body above it moves."""
-
-
 _JOINT_SHARE, _SMALL_TURN = 0.25, 0.1
 """Fraction of the nodes of a part, those nearest to the rest of the body, whose middle is its joint, and angle in
 radians by which a part is rotated to find its share of the rotation of the body."""
