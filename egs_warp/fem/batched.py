@@ -26,10 +26,11 @@ class BatchedRecord:
     def scatter(self, worlds: torch.Tensor, values: Self) -> None:
         """Write the rows of ``values`` to the ``worlds`` (k,) of this record, in place."""
         for name, value in self.batched_fields():
+            rows = getattr(values, name)
             if isinstance(value, BatchedRecord):
-                value.scatter(worlds, getattr(values, name))
-            else:
-                value[worlds] = getattr(values, name)
+                value.scatter(worlds, rows)
+            elif rows is not value:  # Records of all worlds may share a tensor, see ``subset``.
+                value[worlds] = rows
 
     def batched_fields(self) -> list[tuple[str, Any]]:
         """Return names and values of the fields that have a world axis."""
