@@ -26,7 +26,7 @@ from tests.support.disk_faults import assert_one_line, fail_once
 
 PATIENCE = 900.0
 """Seconds that a run may take on a busy machine."""
-MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "4"))
+MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "2"))
 """Times at which each command is killed once; by default the short form of docs/reliability.md."""
 SEED = os.environ.get("EGS_WARP_SEED", "")
 """Seed of the times, so that several processes can test different ones."""
@@ -143,7 +143,7 @@ def test_random_moments(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not [path for path in whole.iterdir() if path.is_dir() or path.name.startswith(".")]
     length = time.monotonic() - began
     moments = random.Random(name + SEED)
-    for number, ending in enumerate([signal.SIGKILL] * MOMENTS + [signal.SIGINT] * (MOMENTS // 4)):
+    for number, ending in enumerate([signal.SIGKILL] * MOMENTS + [signal.SIGINT] * -(-MOMENTS // 4)):
         out = tmp_path / str(number)
         ended_by(animate(name, folder, out), ending, folder, length * moments.random())
         assert finishes(["resume", str(out)] if has_begun(out) else animate(name, folder, out)) == status

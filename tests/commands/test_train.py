@@ -17,7 +17,7 @@ from tests.support.posed import posed_folder
 
 pytest.importorskip("torch")
 
-MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "4"))
+MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "2"))
 OFTEN = (
     "import sys; from egs_warp.training import checkpoint; checkpoint.SECONDS = 0.0;"
     " from egs_warp.cli import main; sys.exit(main(sys.argv[1:]))"
