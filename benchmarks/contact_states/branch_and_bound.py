@@ -158,7 +158,7 @@ def _bounds(program: PyramidProgram, branches: tuple[_Branch, ...]) -> tuple[np.
     """Return lower and upper bounds of all rows, where undecided pairs are only non-negative."""
     layout = program.layout
     n, nd = layout.contacts, layout.directions
-    lower, upper = layout.bounds(np.full(n, SEPARATE))
+    lower, upper = layout.bounds(np.full(n, SEPARATE), program.lower, program.upper)
     upper[layout.activations :] = np.inf
     friction = upper[layout.tangent].reshape(n, nd)
     slip = upper[layout.paired(layout.tangent)].reshape(n, nd)

@@ -76,11 +76,12 @@ class ContactLayout:
         free[between, (states[between] + 1) % nd] = True
         return free
 
-    def bounds(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower and upper bounds of all rows: each of ``states`` (n,) fixes one side of each pair to zero."""
+    def bounds(self, states: np.ndarray, lowest: np.ndarray, highest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return lower and upper bounds of all rows: each of ``states`` (n,) fixes one side of each pair to zero, and
+        the activations are between ``lowest`` and ``highest`` (M,)."""
         lower = np.zeros(2 * self.variables - self.activations)
         upper = np.full_like(lower, np.inf)
-        lower[: self.activations], upper[: self.activations] = -1.0, 1.0
+        lower[: self.activations], upper[: self.activations] = lowest, highest
         touching = states >= STATIC
         free = self.free_directions(states).ravel()
         upper[self.normal][~touching] = 0.0

@@ -58,8 +58,7 @@ class PyramidProgram:
 
     def bounds(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower and upper bounds (rows,) of A y for contact ``states`` (n,)."""
-        lower, upper = self.layout.bounds(states)
-        lower[: self.layout.activations], upper[: self.layout.activations] = self.lower, self.upper
+        lower, upper = self.layout.bounds(states, self.lower, self.upper)
         return lower - self.offset, upper - self.offset
 
     def pairs(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

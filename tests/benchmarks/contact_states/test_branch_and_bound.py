@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,14 @@ def test_the_optimum_equals_brute_force(contacts: int, directions: int, seeds: i
         assert found.qp_count < 0.5 * (2 * directions + 2) ** contacts + 20
     if seeds > 3:
         assert len(best_states) == 2 * directions + 2
+
+
+def test_the_bounds_of_the_activations_hold() -> None:
+    """The optimum has the bounds of the program, which need not be -1 and 1."""
+    program = small_problem(5).pyramid
+    narrow = replace(program, lower=np.full(3, -0.05), upper=np.full(3, 0.02))
+    found, best = exact_states(narrow), min(value for value, _ in optimum_of_each(narrow).values())
+    assert found is not None and found.objective == pytest.approx(best, rel=1e-6, abs=1e-6)
 
 
 def test_starts_change_only_the_number_of_qps() -> None:
