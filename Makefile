@@ -15,7 +15,7 @@ BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 # Errors only: warnings about mirrors and the root user would fill the screen.
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-rest test-all test-page fuzz mutation coverage release blender test-blender setup lint lint-workflows types docs pictures paper build web examples clean
+.PHONY: demo test test-rest test-all test-page fuzz mutation release blender test-blender setup lint lint-workflows types docs pictures paper build web examples clean
 
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
@@ -36,8 +36,12 @@ examples: setup
 # tests/conftest.py starts with the long files, so that both processes end at about the same time.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
+# make test COVERAGE=1 measures the branch coverage of these packages, which has a floor.
+COVERED := contact deformation fem geometry io locomotion meshing muscles render segmentation
+FLOOR := 95
 test: setup
-	$(PYTEST) -m "not (slow or data or example or browser)"
+	$(PYTEST) -m "not (slow or data or example or browser)" $(if $(COVERAGE),$(COVERED:%=--cov=egs_warp/%) \
+		--cov-branch --cov-report=term:skip-covered --cov-fail-under=$(FLOOR))
 
 # What "make test" leaves out: long runs, real captures, the examples, the page in Chromium.
 test-rest: setup
@@ -48,13 +52,6 @@ test-all: test test-rest
 # The quick tests of the viewer's page in the system's Chromium or Chrome; SHOTS=FOLDER stores a screenshot of each.
 test-page: setup
 	$(SHOTS:%=EGS_WARP_SHOTS=%) $(PYTEST) tests/web -m "browser and not slow"
-
-# Branch coverage of these packages by their own fast tests and those of odd numbers and faults, with a floor.
-COVERED := contact deformation fem geometry io locomotion meshing muscles render segmentation
-FLOOR := 95
-coverage: setup
-	$(PYTEST) -m "not (slow or data or example or browser)" $(COVERED:%=tests/%) tests/test_extremes.py tests/test_disk_faults.py \
-		$(COVERED:%=--cov=egs_warp/%) --cov-branch --cov-report=term:skip-covered --cov-fail-under=$(FLOOR)
 
 # Random search; make test runs a fixed set of examples. First the property tests with ten times as many examples, which
 # takes about ten minutes on two cores: each failing example is printed as an @example line to add to its test. Then

@@ -26,7 +26,7 @@ from tests.support.disk_faults import assert_one_line, fail_once
 
 PATIENCE = 900.0
 """Seconds that a run may take on a busy machine."""
-MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "2"))
+MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "1"))
 """Times at which each command is killed once; by default the short form of docs/reliability.md."""
 SEED = os.environ.get("EGS_WARP_SEED", "")
 """Seed of the times, so that several processes can test different ones."""
