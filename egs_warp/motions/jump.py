@@ -131,7 +131,7 @@ class Jump:
         self._time_unit = float(np.sqrt(body.height / self.gravity))
         # Feet on legs stay where they touch down while the fall is stopped.
         self._landing_time = LANDING_TIME * self._time_unit if on_legs else 0.0
-        self._support_ahead = self.controller.footprint.distance_along(np.zeros(2), np.array([1.0, 0.0]))
+        self._support_ahead = self.controller.footprint.extent(np.array([1.0, 0.0]))
         self._style, self._step, self._max_lean = stance.style, stance.step, MAX_LEAN * self._support_ahead
         self.plan = self._plan_for(target)
         self._skips_settling = skips_settling

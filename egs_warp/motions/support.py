@@ -75,12 +75,10 @@ class SupportPolygon:
             ((self.normals @ point - levels) / np.maximum(self.offsets - levels, min_distance)).max(initial=0.0)
         )
 
-    def distance_along(self, point: np.ndarray, direction: np.ndarray) -> float:
-        """Return the distance in metres from ``point`` (2,) to the edge along the unit vector ``direction`` (2,); 0 if
-        the point is outside."""
-        closing = self.normals @ direction
-        ahead = closing > 0.0
-        return max(float(((self.offsets - self.normals @ point)[ahead] / closing[ahead]).min()), 0.0)
+    def extent(self, direction: np.ndarray) -> float:
+        """Return the distance in metres from the origin to the farthest point along the unit vector ``direction``
+        (2,): the support function of the polygon."""
+        return float((self.corners @ direction).max())
 
     def nearest(self, point: np.ndarray) -> np.ndarray:
         """Return the point (2,) of the polygon nearest to ``point`` (2,)."""

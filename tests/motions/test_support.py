@@ -47,8 +47,8 @@ def test_margins_of_a_triangle() -> None:
     assert TRIANGLE.margin(np.array([97.0, 96.0])) == pytest.approx(-5.0)
     assert TRIANGLE.relative_distance(middle, 1e-3) == pytest.approx(0.0)
     assert TRIANGLE.relative_distance(middle - [0.5, 0.0], 1e-3) == pytest.approx(0.5)
-    assert TRIANGLE.distance_along(middle, np.array([1.0, 0.0])) == pytest.approx(1.0)
-    assert TRIANGLE.distance_along(middle + 3.0, np.array([1.0, 0.0])) == 0.0
+    assert TRIANGLE.extent(np.array([1.0, 0.0])) == pytest.approx(103.0)
+    assert TRIANGLE.extent(np.array([-0.6, -0.8])) == pytest.approx(-140.0)
     assert TRIANGLE.scaled(0.5).margin(middle) == pytest.approx(0.5 * np.sqrt(0.5))
     assert TRIANGLE.moved(np.array([0.0, 2.0])).margin(middle + [0.0, 2.0]) == pytest.approx(np.sqrt(0.5))
 
