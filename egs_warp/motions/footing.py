@@ -8,11 +8,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from egs_warp.motions.feet import Foot
-from egs_warp.motions.pendulum import is_line
 from egs_warp.motions.sequence import Stance
+from egs_warp.motions.support import SupportPolygon, is_line
 
 LANDED_HEIGHT = 0.005
 """Height above the ground, in body heights, below which a foot at the end of its swing counts as landed even without
@@ -52,7 +51,7 @@ class FootholdPlanner:
             own = points[clear & (owner == index)] - centres[index]
             if len(own) < 3 or is_line(own):
                 own = arms[:, :2]
-            grips.append(own if is_line(own) else own[ConvexHull(own).vertices])
+            grips.append(SupportPolygon.hull(own).corners)
         return grips
 
     @property
@@ -90,15 +89,15 @@ class FootholdPlanner:
         arms = self._arms[index]
         return np.column_stack([arms[:, :2] @ _flat(footprint[3]).T, arms[:, 2]]) + footprint[:3]
 
-    def support_points(self, footprints: np.ndarray, standing: Sequence[int], margin: float) -> np.ndarray:
-        """Return the contact points (k, 2) of the ``standing`` feet on their ``footprints`` (F, 4), scaled about the
-        middle of each foot by ``margin``."""
+    def support(self, footprints: np.ndarray, standing: Sequence[int], margin: float) -> SupportPolygon:
+        """Return the hull of the contact points of the ``standing`` feet on their ``footprints`` (F, 4), scaled about
+        the middle of each foot by ``margin``."""
         pieces = []
         for index in standing:
             grip, foot = self.grips[index], footprints[index]
             middle = grip.mean(axis=0)
             pieces.append(foot[:2] + (middle + margin * (grip - middle)) @ _flat(foot[3]).T)
-        return np.concatenate(pieces)
+        return SupportPolygon.hull(np.concatenate(pieces))
 
     def _on_ground(self, index: int, level: np.ndarray, heading: float) -> np.ndarray:
         """Return the foothold (4,) of foot ``index`` on the ground at ``level`` (2,)."""

@@ -29,6 +29,7 @@ from egs_warp.motions.jump_plan import (
 )
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import BalanceController, GroundFrame, Measurement, RestDetector, Weights, sole_shares
+from egs_warp.motions.support import nearest_in_half_planes
 from egs_warp.motions.walk_posture import LeggedPosture, select_posture
 
 STOP_RISE_FRACTION = 0.94
@@ -130,8 +131,8 @@ class Jump:
         self._time_unit = float(np.sqrt(body.height / self.gravity))
         # Feet on legs stay where they touch down while the fall is stopped.
         self._landing_time = LANDING_TIME * self._time_unit if on_legs else 0.0
-        ahead = ground.axes[0] @ (stance.contact_points - body.centre_of_mass(stance.standing)).T
-        self._style, self._step, self._max_lean = stance.style, stance.step, MAX_LEAN * float(ahead.max())
+        self._support_ahead = self.controller.footprint.extent(np.array([1.0, 0.0]))
+        self._style, self._step, self._max_lean = stance.style, stance.step, MAX_LEAN * self._support_ahead
         self.plan = self._plan_for(target)
         self._skips_settling = skips_settling
         self.phase, self._entered = JumpPhase.SETTLE, 0.0
@@ -166,7 +167,7 @@ class Jump:
             target,
             height=self.body.height,
             com_height=self.controller.standing_height,
-            support_ahead=float(self.controller.support_high[0]),
+            support_ahead=self._support_ahead,
             gravity=self.gravity,
             step=self._step,
             lean=min(LEAN_FRACTION * target.distance, self._max_lean),
@@ -437,17 +438,17 @@ class Jump:
         falling = max(left * self.gravity - measurement.velocity[2], 0.0)
         capture_time = stopping_time(self.controller.standing_height, falling, self.gravity, self._landing_time)
         capture = touch_down[:2] + measurement.velocity[:2] * capture_time + self.controller.base_offset
-        # Keep the capture point within this part of the footprint.
-        low, high = (
-            self._max_foothold_offset(edge) for edge in (self.controller.support_low, self.controller.support_high)
+        # Keep the capture point within this part of the footprint: the offset of the capture point from the foothold.
+        return capture - nearest_in_half_planes(
+            self.controller.footprint.normals, self._max_foothold_offsets(), capture - self._start_base
         )
-        return np.clip(self._start_base, capture - high, capture - low)
 
-    def _max_foothold_offset(self, edge: np.ndarray) -> np.ndarray:
-        """Return the largest offset (2,) in metres of the capture point towards an ``edge`` (2,) of the footprint."""
-        width = np.abs(edge) / self.controller.standing_height
+    def _max_foothold_offsets(self) -> np.ndarray:
+        """Return the largest offsets (m,) in metres of the capture point towards the edges of the footprint."""
+        away = self.controller.footprint.offsets
+        width = away / self.controller.standing_height
         return (
-            MAX_FOOTHOLD_OFFSET * np.clip((width - NARROW_SUPPORT) / (WIDE_SUPPORT - NARROW_SUPPORT), 0.0, 1.0) * edge
+            MAX_FOOTHOLD_OFFSET * np.clip((width - NARROW_SUPPORT) / (WIDE_SUPPORT - NARROW_SUPPORT), 0.0, 1.0) * away
         )
 
     def _body_objectives(

@@ -10,10 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import ConvexHull
-
-_LINE_TOLERANCE = 1e-6
-"""Largest ratio of width to length of collinear points."""
 
 
 @dataclass(frozen=True)
@@ -53,27 +49,3 @@ def drift(off: np.ndarray, push: np.ndarray, growth: float) -> np.ndarray:
         growth: exp(w t) for the time t of the prediction.
     """
     return off * growth - push * (growth - 1.0)
-
-
-def nearest_in_hull(points: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Return the point (2,) of the convex hull of ``points`` (k, 2) nearest to ``point`` (2,). The points may be
-    collinear."""
-    if is_line(points):
-        middle = points.mean(axis=0)
-        along = np.linalg.svd(points - middle, full_matrices=False)[2][0]
-        coordinates = (points - middle) @ along
-        return middle + np.clip((point - middle) @ along, coordinates.min(), coordinates.max()) * along
-    hull = ConvexHull(points)
-    if np.all(hull.equations[:, :2] @ point + hull.equations[:, 2] <= 0.0):
-        return point
-    corners = points[hull.vertices]
-    sides = np.roll(corners, -1, axis=0) - corners
-    along = np.einsum("ki,ki->k", point - corners, sides) / np.einsum("ki,ki->k", sides, sides)
-    candidates = corners + np.clip(along, 0.0, 1.0)[:, None] * sides
-    return candidates[np.argmin(np.linalg.norm(candidates - point, axis=1))]
-
-
-def is_line(points: np.ndarray) -> bool:
-    """Return True if ``points`` (k, 2) span no area."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return len(points) < 3 or bool(spread[1] <= _LINE_TOLERANCE * spread[0])

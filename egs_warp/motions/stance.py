@@ -21,6 +21,7 @@ from egs_warp.locomotion.objectives import (
     deformation_velocities,
 )
 from egs_warp.locomotion.stepper import StepReport
+from egs_warp.motions.support import SupportPolygon
 
 SHEAR_BASIS = np.einsum("ki,j->kij", np.eye(3)[:2], np.eye(3)[2])
 """(2, 3, 3) change of a sheared pose per unit of lean forward and to the left."""
@@ -34,6 +35,14 @@ REST_TIME = 0.3
 """Time in sqrt(H / g) for which a body is slow before it is at rest."""
 SUPPORT_MARGIN = 0.95
 """Fraction of the footprint within which the centre of pressure stays."""
+_MIN_FOOTPRINT = 0.01
+"""Half width in body heights of the square about the centre of mass that every footprint contains."""
+_PUSH_REACH = 0.04
+"""Half width in body heights of the square about the centre of mass in which the centre of pressure may always lie."""
+_BALANCE_PRIORITY_MARGINS = (0.25, 0.5)
+"""Capture margins (``BalanceController.capture_margin``) at which balance starts to have priority over uprighting, and
+at which it has full priority."""
+_SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 FRICTION_FRACTION = 0.95
 """Fraction of the friction cone that objectives may use; with more, feet slide and other objectives fall short."""
 
@@ -74,8 +83,8 @@ class Measurement:
     """Sum of the normal contact forces, body weights."""
     heading: float
     """Heading relative to the start, radians about z."""
-    support: np.ndarray
-    """(2, 2) m, smallest and largest ground coordinates of the points in contact."""
+    support: SupportPolygon
+    """Hull of the points in contact, ground coordinates."""
     angular_velocity_term: np.ndarray
     """(2,) m/s, contribution of the spin to the angular momentum about the feet, as an equivalent velocity of the
     centre of mass along the ground."""
@@ -188,8 +197,9 @@ class BalanceController:
                 "body: no point of the body is on the ground at the start; check the ground", check=("plane", "up")
             )
         footprint = ground.local(contact_points)[:, :2] - body.centre_of_mass(local)[:2]
-        self.support_low = np.minimum(footprint.min(axis=0), -0.01 * body.height)
-        self.support_high = np.maximum(footprint.max(axis=0), 0.01 * body.height)
+        # The centre of mass of a body that stands lies in its footprint, even if few points are in contact.
+        self.footprint = SupportPolygon.hull(np.concatenate([footprint, _MIN_FOOTPRINT * body.height * _SQUARE]))
+        """Hull of the contact points at rest, relative to the centre of mass."""
         self.gesture_turn = np.zeros(3)
         """(3,) rotation vector of the body that is due to gestures of its parts, radians, ground axes; the measured
         rotation does not contain it."""
@@ -226,20 +236,21 @@ class BalanceController:
 
         level = within_grip(level)
         pressure = measurement.com[:2] - height / up * (level + turn) / dt
-        middle, reach = (
-            measurement.support.mean(axis=0),
-            0.5 * SUPPORT_MARGIN * (measurement.support[1] - measurement.support[0]),
-        )
-        # Never request a fall: a small push in either direction stays allowed even with the centre of mass beyond the
+        # Never request a fall: a small push in any direction stays allowed even with the centre of mass beyond the
         # edge.
-        slack = 0.04 * self.body.height
-        low = np.minimum(middle - reach, measurement.com[:2] - slack)
-        high = np.maximum(middle + reach, measurement.com[:2] + slack)
-        both = (measurement.com[:2] - np.clip(pressure, low, high)) * up / height * dt
+        slack = measurement.com[:2] + _PUSH_REACH * self.body.height * _SQUARE
+        allowed = SupportPolygon.hull(np.concatenate([measurement.support.scaled(SUPPORT_MARGIN).corners, slack]))
+        both = (measurement.com[:2] - allowed.nearest(pressure)) * up / height * dt
         # Both terms are reduced according to the weights of their objectives, speeds directly, spins with the radius of
         # gyration. The part of the speed that exceeds the friction limit is assigned to the spin.
         share = 1.0 / (1.0 + 0.5 * np.trace(measurement.inertia) / (self.body.mass * height**2))
-        level = within_grip(level + share * (both - level - turn))
+        shared = level + share * (both - level - turn)
+        # Uprighting must not drive the centre of mass away from the feet: where the capture point is far out, the body
+        # moves outward no faster than it would without uprighting.
+        away = self._capture(measurement) - measurement.support.middle
+        away /= max(float(np.linalg.norm(away)), 1e-12)
+        excess = max(float(away @ shared) - float(max(away @ level, away @ both)), 0.0)
+        level = within_grip(shared - self._balance_priority(measurement) * excess * away)
         turn = both - level
         swing = measurement.angular_velocity_term + turn
         momentum = self.ground.axes @ measurement.inertia @ spin
@@ -258,8 +269,12 @@ class BalanceController:
     def capture_margin(self, measurement: Measurement) -> float:
         """Return the distance of the capture point from the middle of the support, relative to the distance of its
         edge. Beyond 1, the body falls unless it steps."""
-        middle, reach = measurement.support.mean(axis=0), 0.5 * (measurement.support[1] - measurement.support[0])
-        return float((np.abs(self._capture(measurement) - middle) / np.maximum(reach, 1e-3 * self.body.height)).max())
+        return measurement.support.relative_distance(self._capture(measurement), 1e-3 * self.body.height)
+
+    def _balance_priority(self, measurement: Measurement) -> float:
+        """Return the priority of balance over uprighting, from 0 to 1."""
+        start, full = _BALANCE_PRIORITY_MARGINS
+        return min(max((self.capture_margin(measurement) - start) / (full - start), 0.0), 1.0)
 
     def _pendulum_rate2(self, measurement: Measurement) -> float:
         """Return the squared rate of the linear inverted pendulum, 1/s^2."""
@@ -307,13 +322,12 @@ class BalanceController:
             inertia=self.body.inertia(state.positions),
         )
 
-    def _support(self, local: np.ndarray, report: StepReport | None) -> np.ndarray:
-        """Return ``Measurement.support`` (2, 2); the whole footprint without contacts."""
+    def _support(self, local: np.ndarray, report: StepReport | None) -> SupportPolygon:
+        """Return ``Measurement.support``; the whole footprint without contacts."""
         if report is None or report.contacts.count == 0:
-            return self._base(local) - self.base_offset + np.stack([self.support_low, self.support_high])
+            return self.footprint.moved(self._base(local) - self.base_offset)
         contacts = report.contacts
-        points = np.einsum("cw,cwi->ci", contacts.weights, local[contacts.nodes])[:, :2]
-        return np.stack([points.min(axis=0), points.max(axis=0)])
+        return SupportPolygon.hull(np.einsum("cw,cwi->ci", contacts.weights, local[contacts.nodes])[:, :2])
 
     def _rotation(self, positions: np.ndarray) -> np.ndarray:
         arms = positions - self.body.centre_of_mass(positions)

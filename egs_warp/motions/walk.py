@@ -31,7 +31,7 @@ from egs_warp.motions.feet import foot_loads, foot_of_contact, foot_of_node, ord
 from egs_warp.motions.footfalls import Footfalls, footfalls
 from egs_warp.motions.footing import FootholdPlanner
 from egs_warp.motions.gait import Gait, smooth
-from egs_warp.motions.pendulum import PendulumPlan, drift, nearest_in_hull
+from egs_warp.motions.pendulum import PendulumPlan, drift
 from egs_warp.motions.route import Route, StepLimits
 from egs_warp.motions.route_check import check_route
 from egs_warp.motions.sequence import Stance
@@ -366,8 +366,8 @@ class Walk:
                 continue
             lifted = self.gait.swing_feet(swing)
             standing = [foot for foot in range(len(self.feet)) if foot not in lifted]
-            under = self._planner.support_points(footprints, standing, self.control.planned_margin)
-            yield phase, np.array([nearest_in_hull(under, target) for target in targets])
+            under = self._planner.support(footprints, standing, self.control.planned_margin)
+            yield phase, np.array([under.nearest(target) for target in targets])
             for foot in lifted:
                 footprints[foot] = self._planner.nominal_foothold(self.planar_poses[self.gait.target_step(swing)], foot)
             phase = self._after_swing(swing)
@@ -403,10 +403,10 @@ class Walk:
         pressure, divergent = self._plan.at(elapsed)
         off = com[:2] + velocity[:2] / self._rate - divergent
         standing = [foot for foot in range(len(self.feet)) if foot not in self.swinging]
-        under = self._planner.support_points(
+        under = self._planner.support(
             self._planner.current_footholds(local, self._footprints), standing, self.control.margin
         )
-        pressed = nearest_in_hull(under, pressure + self.control.balance * off)
+        pressed = under.nearest(pressure + self.control.balance * off)
         self._target_pressure = pressed
         if self.swinging and elapsed < self.gait.transfer_end_time:
             left = max(self.gait.swing_time - elapsed, 0.0)

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
-from scipy.optimize import minimize
 
-from egs_warp.motions.pendulum import PendulumPlan, drift, nearest_in_hull
+from egs_warp.motions.pendulum import PendulumPlan, drift
 
 RATE = 4.4
 
@@ -44,28 +41,3 @@ def test_an_error_of_the_divergent_component_grows() -> None:
     off, push, time = np.array([0.01, -0.02]), np.array([0.03, 0.01]), 0.4
     solved = solve_ivp(lambda _, x: RATE * (x - push), (0.0, time), off, rtol=1e-11, atol=1e-13).y[:, -1]
     assert drift(off, push, float(np.exp(RATE * time))) == pytest.approx(solved, abs=1e-8)
-
-
-@given(st.integers(0, 1000))
-def test_nearest_point_of_a_hull_is_the_best_convex_combination(seed: int) -> None:
-    """The closest weighted mean of the points, found by SciPy."""
-    rng = np.random.default_rng(seed)
-    points, place = rng.standard_normal((8, 2)), 2.0 * rng.standard_normal(2)
-    found = nearest_in_hull(points, place)
-    best = minimize(
-        lambda w: ((w @ points - place) ** 2).sum(),
-        np.full(8, 1 / 8),
-        jac=lambda w: 2.0 * points @ (w @ points - place),
-        bounds=[(0, 1)] * 8,
-        constraints={"type": "eq", "fun": lambda w: w.sum() - 1.0, "jac": lambda w: np.ones(8)},
-        options={"ftol": 1e-14, "maxiter": 300},
-    )
-    assert np.linalg.norm(found - place) == pytest.approx(np.sqrt(best.fun), abs=1e-4)
-
-
-def test_nearest_point_of_a_line() -> None:
-    """The nearest point is between the ends, or one of them."""
-    points = np.array([[0.0, 0.0], [1.0, 1.0], [0.5, 0.5]])
-    for place, nearest in (([1.0, 0.0], [0.5, 0.5]), ([3.0, 1.0], [1.0, 1.0]), ([-1.0, 0.0], [0.0, 0.0])):
-        assert nearest_in_hull(points, np.array(place)) == pytest.approx(nearest)
-    assert nearest_in_hull(points[1:2], np.zeros(2)) == pytest.approx([1.0, 1.0])

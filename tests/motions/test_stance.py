@@ -66,6 +66,20 @@ def test_balance_targets_are_the_nearest_that_do_not_tip(
         assert np.sqrt(got) >= np.sqrt(missed[stands].min()) - 5e-3
 
 
+@pytest.mark.parametrize(("ahead", "is_driven"), [(0.02, True), (0.12, False)])
+def test_uprighting_does_not_drive_a_body_off_its_feet(place: Stance, ahead: float, is_driven: bool) -> None:
+    """A body at rest is turned backward by more than its feet allow. Near the middle of its support, the deficit is
+    shared, so the body moves forward; with the centre of mass half-way to the edge, it does not, and the centre of
+    pressure is still at the edge."""
+    pose, state, seen = measured_body(place, 1e3, (ahead, 0.0, 0.0))
+    velocity, turned = pose.balance_targets(seen, np.zeros(3), np.array([0.0, -2.0, 0.0]), DT)
+    assert velocity[0] > 1e-3 if is_driven else velocity[0] == pytest.approx(0.0, abs=1e-12)
+    change = velocity[:2] + swing(place, state, seen, turned)
+    pressure = seen.com[:2] - seen.com[2] / GRAVITY * change / DT
+    middle = place.ground.local(place.contact_points)[:, :2].mean(axis=0)
+    assert pressure[0] - middle[0] == pytest.approx(SUPPORT_MARGIN * EDGE)
+
+
 def test_feasible_targets_are_unchanged_and_a_falling_body_may_move_in_both_directions(place: Stance) -> None:
     pose, _, seen = measured_body(place, 1e3, (0.0, 0.0, 0.0))
     asked, spin = np.array([0.01, -0.005, 0.02]), np.array([0.01, 0.02, 0.5])

@@ -20,9 +20,9 @@ from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.footfalls import Footfalls
-from egs_warp.motions.pendulum import nearest_in_hull
 from egs_warp.motions.route import Route, path_route, straight_route, turn_route
 from egs_warp.motions.script import motion
+from egs_warp.motions.support import SupportPolygon
 from egs_warp.motions.walk import MAX_LEAD, MIN_REAR_MARGIN, Walk
 from egs_warp.motions.walk_plan import WalkPhase
 from egs_warp.motions.walk_posture import LeggedPosture
@@ -206,11 +206,13 @@ def test_the_planned_pressure_is_under_the_standing_feet(mesh: Callable[[], TetM
     lifted = walk.gait.swing_feet(0)
     stands = [index for index in range(len(walk.feet)) if index not in lifted]
     assert stands and len(stands) < len(walk.feet)
-    under = np.concatenate([walk._planner.soles[index, :2] + walk._planner.grips[index] for index in stands])
-    assert nearest_in_hull(under, swing) == pytest.approx(swing, abs=1e-9)
+    under = SupportPolygon.hull(
+        np.concatenate([walk._planner.soles[index, :2] + walk._planner.grips[index] for index in stands])
+    )
+    assert under.margin(swing) >= -1e-9
     if len(lifted) == 1:  # the diagonals of four feet cross
         other = walk._planner.soles[lifted[0], :2] + walk._planner.grips[lifted[0]]
-        assert np.linalg.norm(nearest_in_hull(other, swing) - swing) > 0.0
+        assert SupportPolygon.hull(other).margin(swing) < 0.0
     reach = 0.3 + np.ptp(place.standing[:, :2], axis=0)
     assert np.all(np.abs(plan.divergent - walk._start_com[:2]) < reach)
 

@@ -265,7 +265,7 @@ OTHER_FORMULAS: list[Mutation] = [
         ),
         (
             *("balance: the margin of the footprint", "motions/stance.py"),
-            *("0.5 * SUPPORT_MARGIN * (measurement.support[1]", "0.5 * (measurement.support[1]"),
+            *("measurement.support.scaled(SUPPORT_MARGIN)", "measurement.support"),
             "motions/test_stance.py::test_balance_targets_are_the_nearest_that_do_not_tip",
         ),
         (
