@@ -40,15 +40,12 @@ TURN, LIFT = 70.0, 0.25
 """Degrees about the vertical, and heights of the toy."""
 
 
-
 def room_light(number: int, seed: int, *, is_frontal: bool) -> RoomLight:
     """Return the light of the room ``number``; a frontal light comes from the side of the photographer."""
     random = np.random.default_rng([seed, number, 7])
     low, high = (-150.0, -30.0) if is_frontal else (-180.0, 180.0)
     azimuth, elevation = np.radians([random.uniform(low, high), random.uniform(32.0, 62.0)])
-    direction = np.array(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
+    direction = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     key = 0.0 if number % 5 == 4 else float(random.uniform(0.5, 1.0))
     return RoomLight(direction, float(random.uniform(1.0, 10.0)), key)
 
@@ -130,7 +127,9 @@ def _moved_solids(scene: SyntheticScene, size: float) -> list[Solid]:
     return [one.moved((0.0, 0.0, LIFT * size), TURN) for one in scene.solids[0]]
 
 
-def _truth(rest: GaussianCloud, turned: GaussianCloud, scene: SyntheticScene, size: float, light: RoomLight) -> GaussianCloud:
+def _truth(
+    rest: GaussianCloud, turned: GaussianCloud, scene: SyntheticScene, size: float, light: RoomLight
+) -> GaussianCloud:
     """Return the turned toy with the colours that the light gives it."""
     toy, others = scene.solids
     levels = []
@@ -144,7 +143,9 @@ def _truth(rest: GaussianCloud, turned: GaussianCloud, scene: SyntheticScene, si
     return replace(turned, sh=sh)
 
 
-def _overlaps(scene: SyntheticScene, turned: GaussianCloud, plane: Plane, size: float, light: RoomLight, found: MainLight | None) -> Row:
+def _overlaps(
+    scene: SyntheticScene, turned: GaussianCloud, plane: Plane, size: float, light: RoomLight, found: MainLight | None
+) -> Row:
     """Return the overlap of the shadow with the true one: straight below the toy, and by the light that was found."""
     side = np.arange(-2.4, 2.41, 0.03)
     flat = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
@@ -202,8 +203,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options.density = options.density or (0.5 if options.quick else 1.0)
     names = options.only or list(SCENES)[:: 3 if options.quick else 1]
     table = Table(
-        scene="<26", lit="<4", degrees="6.1f", shade=".2f", before=".2f", IoU=".2f", known=".2f", dB_before=".1f",
-        dB=".1f", s=".1f", note="<",
+        scene="<26",
+        lit="<4",
+        degrees="6.1f",
+        shade=".2f",
+        before=".2f",
+        IoU=".2f",
+        known=".2f",
+        dB_before=".1f",
+        dB=".1f",
+        s=".1f",
+        note="<",
     )
     rows, pictures = [], []
     for name in names:

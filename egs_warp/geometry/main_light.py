@@ -1,4 +1,4 @@
-"""The main light of a capture: its direction and softness, the shadow that it casts, and the irradiance of a surface."""
+"""The main light of a capture: its direction, softness and shadow, and the irradiance of a surface."""
 
 from __future__ import annotations
 
@@ -29,6 +29,20 @@ class MainLight:
         whole = np.eye(4)
         whole[:3, :3] = axes
         return replace(self, direction=axes @ self.direction, irradiance=whole @ self.irradiance @ whole.T)
+
+
+def check_light(light: MainLight) -> None:
+    """Raise ``ValueError`` for a light whose numbers are not finite or outside of their ranges."""
+    numbers = np.concatenate([light.direction, light.irradiance.ravel()])
+    is_valid = np.isfinite(numbers).all() and abs(float(np.linalg.norm(light.direction)) - 1.0) < 1e-3
+    is_valid &= 0.0 < light.half_angle < 90.0 and 0.0 <= light.shade < 1.0 and mean_irradiance(light) > 0.0
+    if not is_valid or not np.allclose(light.irradiance, light.irradiance.T):
+        raise ValueError("the light is invalid")
+
+
+def mean_irradiance(light: MainLight) -> float:
+    """Return the mean irradiance of all normals."""
+    return float(light.irradiance[3, 3] + np.trace(light.irradiance[:3, :3]) / 3.0)
 
 
 def irradiance_form(ambient: float, slope: float, up: np.ndarray, key: float, direction: np.ndarray) -> np.ndarray:

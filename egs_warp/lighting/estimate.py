@@ -6,7 +6,7 @@ would be lit. Both are compared with the logarithm of the captured brightness by
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import nnls

@@ -34,6 +34,8 @@ _COVERED = 0.35
 """Part of a cell that the object covers seen from above, from which no photo shows it."""
 _OUTLIER = 2.5
 """Largest residual that counts in full, in robust standard deviations."""
+_MIN_LIMIT = 1.0
+"""Residual of the natural logarithm that always counts in full: a deep shadow on plain ground is no outlier."""
 _AMBIENT = (0.06, 0.25)
 """Radii of the darkening around an object that any light causes, in sizes of the object."""
 
@@ -55,7 +57,7 @@ class Regression:
         basis = basis[:, np.abs(np.diag(upper)) > 1e-9 * np.abs(upper).max(initial=1.0)]
         residual = values - basis @ (basis.T @ values)
         for _ in range(2):
-            limit = _OUTLIER * 1.4826 * float(np.median(np.abs(residual))) + 1e-9
+            limit = max(_OUTLIER * 1.4826 * float(np.median(np.abs(residual))), _MIN_LIMIT)
             clipped = np.clip(residual, -limit, limit)
             residual = clipped - basis @ (basis.T @ clipped)
         return cls(basis, residual, float(residual @ residual))
@@ -85,7 +87,21 @@ class GroundEvidence:
     """Height of the object over the ground, or half of its width if that is larger."""
     points: np.ndarray
     """(n, 3) on the ground."""
+    log_brightness: np.ndarray
+    """(n,) natural logarithm of linear luminance."""
+    causes: np.ndarray | None
+    """(n, k) what else brightness depends on: albedo, place, ambient light, slope; None if too little is visible."""
     regression: Regression | None
+
+    @property
+    def cell(self) -> float:
+        """Side of a cell, scene units."""
+        return _CELL * self.size
+
+    @property
+    def max_height(self) -> float:
+        """Largest height of Gaussians of the ground, scene units."""
+        return _ON_GROUND * self.size
 
     @classmethod
     def of(cls, object_cloud: GaussianCloud, background: GaussianCloud, ground: Plane | HeightField) -> GroundEvidence:
@@ -93,37 +109,40 @@ class GroundEvidence:
         plane = ground if isinstance(ground, Plane) else ground.plane
         means = object_cloud.means.numpy().astype(np.float64)[object_cloud.opacities() > _SOLID]
         if len(means) == 0:
-            return cls(None, plane, np.zeros(3), 1.0, np.zeros((0, 3)), None)
+            return cls(None, plane, np.zeros(3), 1.0, np.zeros((0, 3)), np.zeros(0), None, None)
         axes = np.array(plane.tangents())
         low, high = np.quantile(means @ axes.T, [0.02, 0.98], axis=0)
         size = max(float(np.quantile(ground.heights(means), 0.99)), 0.5 * float((high - low).max()))
         centre = 0.5 * (low + high) @ axes - plane.offset * plane.normal
         points, log_brightness, colours = _cells(background, ground, centre, size)
         caster = _thinned(object_cloud, _MAX_CASTERS)
-        evidence = cls(caster, plane, centre, size, points, None)
+        evidence = cls(caster, plane, centre, size, points, log_brightness, None, None)
         if len(points) < 40:
             return evidence
         flat = (points - centre) @ axes.T / size
-        around = [evidence._shadow(None, spread) for spread in _AMBIENT]
+        around = [evidence.shadow(None, spread) for spread in _AMBIENT]
         visible = around[0] < _COVERED * max(float(around[0].max(initial=0.0)), 1e-6)
         if visible.sum() < 40:
             return evidence
         x, y = flat.T
-        smooth = np.column_stack([x, y, x * x, x * y, y * y, *around])[visible]
+        smooth = np.column_stack([x, y, x * x, x * y, y * y, *around])
+        if isinstance(ground, HeightField):
+            # The shading of its folds.
+            smooth = np.column_stack([smooth, ground.frames(points)[:, 0] @ axes.T])
+        smooth = smooth[visible]
         causes = np.column_stack([_indicators(albedo_groups(colours[visible])), smooth])
-        return cls(
-            caster, plane, centre, size, points[visible], Regression.of(log_brightness[visible], causes)
-        )
+        values = log_brightness[visible]
+        return cls(caster, plane, centre, size, points[visible], values, causes, Regression.of(values, causes))
 
     def judge(self, light: MainLight) -> tuple[float, float]:
         """Return the evidence of the shadow of ``light``, and the decrease of the logarithm of brightness in it; both
         are zero if the ground is brighter there."""
         if self.regression is None:
             return 0.0, 0.0
-        evidence, coefficient = self.regression.judge(self._shadow(light))
+        evidence, coefficient = self.regression.judge(self.shadow(light))
         return (evidence, -coefficient) if coefficient < 0.0 else (0.0, 0.0)
 
-    def _shadow(self, light: MainLight | None, spread: float = 0.0) -> np.ndarray:
+    def shadow(self, light: MainLight | None, spread: float = 0.0) -> np.ndarray:
         """Return the shadow (n,) of the object on the points: of a light, or, spread by a fraction of the size, of the
         sky."""
         return shadow_on(self.points, self.caster, self.plane, self.centre, self.size, light, spread * self.size)
@@ -152,7 +171,12 @@ def shadow_on(
     assert caster is not None
     grain = float(np.hypot(shadow_blur_radius(caster), spread))
     shadow_map = ShadowMap(
-        plane, centre=centre, reach=1.5 * _REACH * size, device=caster.device, blur_radius=grain, height=size,
+        plane,
+        centre=centre,
+        reach=1.5 * _REACH * size,
+        device=caster.device,
+        blur_radius=grain,
+        height=size,
         light=light,
     )
     texels = wp.array(shadow_map.texels(points), dtype=wp.vec2, device=caster.device)
@@ -234,7 +258,11 @@ def _thinned(cloud: GaussianCloud, count: int) -> GaussianCloud:
         return part
     scales = part.log_scales.numpy() + 0.5 * np.log(every)
     return GaussianCloud.from_numpy(
-        part.means.numpy(), part.rotations.numpy(), scales, part.opacity_logits.numpy(), part.sh.numpy(),
+        part.means.numpy(),
+        part.rotations.numpy(),
+        scales,
+        part.opacity_logits.numpy(),
+        part.sh.numpy(),
         device=str(cloud.device),
     )
 
@@ -257,6 +285,7 @@ def _cells(
     column, row = np.floor((flat + _REACH) / _CELL).astype(int).T
     _, cell = np.unique(row * side + column, return_inverse=True)
     total = np.bincount(cell, weights)
+
     def mean(values: np.ndarray) -> np.ndarray:
         return np.column_stack([np.bincount(cell, weights * one) for one in values.T]) / total[:, None]
 

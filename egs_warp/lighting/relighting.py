@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.geometry.main_light import DISPLAY_GAMMA, MainLight
+from egs_warp.geometry.main_light import DISPLAY_GAMMA, MainLight, mean_irradiance
 from egs_warp.kernels.lighting.relighting import relight_kernel
 from egs_warp.launching import launch_rows
 from egs_warp.lighting.surface_normals import surface_normals
@@ -19,8 +19,7 @@ class Relighter:
 
     def __init__(self, rest: GaussianCloud, light: MainLight) -> None:
         """Compute the normals of the cloud ``rest``; the ``light`` is in its axes."""
-        mean = light.irradiance[3, 3] + np.trace(light.irradiance[:3, :3]) / 3.0
-        self._form = wp.mat44(*np.float32(light.irradiance / mean).ravel().tolist())
+        self._form = wp.mat44(*np.float32(light.irradiance / mean_irradiance(light)).ravel().tolist())
         self._normals = wp.array(surface_normals(rest).astype(np.float32), dtype=wp.vec3, device=rest.device)
         self._sh = wp.empty_like(rest.sh)
 

@@ -75,7 +75,9 @@ def render_run(
         steps = np.full(turntable(shot.fps), run.steps[run.frame_number(hold, argument="turntable")])
         base = resized(run.creature.camera, *(shot.size or (run.creature.camera.width, run.creature.camera.height)))
         cameras = around(base, t.positions[steps[:1]], count=len(steps))
-    frames = drawn_frames(run.deformer(), t, steps, cameras, shot, scene=run.scene, shadow=shadow)
+    light = run.creature.light
+    scene = run.scene_without_shadow() if shadow else run.scene
+    frames = drawn_frames(run.deformer(), t, steps, cameras, shot, scene=scene, shadow=shadow, light=light)
     corners = t.positions[steps] if hold is None else t.positions[steps[:1]]
     near, far = _depths(corners.reshape(-1, 3), cameras) if show is Show.DEPTH else (0.0, 1.0)
     pictures = frame_paths(out, range(len(steps)), ".png") if folder else []

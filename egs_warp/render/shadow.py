@@ -1,5 +1,4 @@
-"""Shadows that Gaussians cast on a plane: soft ones straight down, and those of the main light, as one camera sees them.
-"""
+"""Shadows that Gaussians cast on a plane, straight down or by the main light, as one camera sees them."""
 
 from __future__ import annotations
 
@@ -110,7 +109,7 @@ class ShadowMap:
         return shade
 
     def texels(self, points: np.ndarray) -> np.ndarray:
-        """Return the map position (n, 2), texels from the corner, at which the shadow on ``points`` (n, 3) is stored."""
+        """Return the map position (n, 2), texels from the corner, of the shadow on ``points`` (n, 3)."""
         ground, away = self.ground, points - np.array(self.ground.centre)
         axes = np.array([ground.first, ground.second, ground.normal])
         flat = away @ axes.T
@@ -212,9 +211,7 @@ class ContactShadow:
             for one, strength in zip(self._receivers, strengths, strict=True)
         ]
         for other in covers[1:]:
-            launch_rows(
-                kernels.join_covers_kernel, len(other), inputs=[other], outputs=[covers[0]], device=self.device
-            )
+            launch_rows(kernels.join_covers_kernel, len(other), inputs=[other], outputs=[covers[0]], device=self.device)
         return covers[0]
 
     def _on_ground(self, shadow_map: ShadowMap, outputs: list[wp.array]) -> wp.array:
