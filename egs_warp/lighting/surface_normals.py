@@ -11,8 +11,10 @@ _SOLID = 0.3
 """Opacity from which a Gaussian counts as part of the surface."""
 _MAX_POINTS = 12_000
 """Points from which normals are computed; the other Gaussians use the nearest of them."""
-_NEAR, _FAR = 24, 240
+_NEAR, _FAR = 40, 320
 """Neighbours that span a piece of the surface, and that lie behind it: seen from outside, their mean is inside."""
+_MIN_AGREEMENT = 0.6
+"""Length of the mean of neighbouring unit normals below which they give no surface, as in fur or at a thin edge."""
 
 
 def surface_normals(cloud: GaussianCloud) -> np.ndarray:
@@ -37,5 +39,5 @@ def surface_normals(cloud: GaussianCloud) -> np.ndarray:
     # A mean over the same neighbours removes normals of the wrong sign.
     normals = normals[near[:, :_NEAR]].mean(axis=1)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.where(lengths > 1e-6, normals / np.maximum(lengths, 1e-6), 0.0)
+    normals = np.where(lengths > _MIN_AGREEMENT, normals / np.maximum(lengths, _MIN_AGREEMENT), 0.0)
     return normals[tree.query(means)[1]]

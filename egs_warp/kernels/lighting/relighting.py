@@ -15,7 +15,7 @@ _TURNED = wp.constant(wp.float32(0.07))
 """rad, rotation from which the relighting is complete: 4 degrees."""
 _MIN_IRRADIANCE = wp.constant(wp.float32(0.2))
 """Smallest irradiance, relative to its mean; the quadratic form is slightly negative opposite of a single light."""
-_MAX_RATIO = wp.constant(wp.float32(3.0))
+_MAX_RATIO = wp.constant(wp.float32(2.5))
 """Largest ratio of two irradiances. A captured colour near black or white cannot be scaled by more."""
 
 
