@@ -10,7 +10,7 @@ A point of the ground is in shadow if less than half of the light reaches it. Po
 solids anyway do not count.
 
 Aims: ``shadow_overlap`` (mean IoU of at least 0.6 over the lit rooms, and more than before in each), ``relit_psnr``
-(mean PSNR of the object at least 1.5 dB above that without relighting), ``clear`` (a light is found in at least nine
+(mean PSNR of the object at least 1.5 dB above that without relighting), ``clear`` (a light is estimated in at least nine
 tenths of the lit rooms, and no shadow is cast in an overcast one).
 """
 
@@ -34,27 +34,27 @@ from egs_warp.lighting.relighting import Relighter
 from egs_warp.render import render_gaussians
 from harness import Row, Table, flags, report, timed
 from room_scenes import SCENES, SyntheticScene, build_scene
-from room_solids import RoomLight, Solid
+from room_solids import SceneLight, Solid
 
 TURN, LIFT = 70.0, 0.25
 """Degrees about the vertical, and heights of the toy."""
 
 
-def room_light(number: int, seed: int, *, is_frontal: bool) -> RoomLight:
+def light_of_scene(number: int, seed: int, *, is_frontal: bool) -> SceneLight:
     """Return the light of the room ``number``; a frontal light comes from the side of the photographer."""
     random = np.random.default_rng([seed, number, 7])
     low, high = (-150.0, -30.0) if is_frontal else (-180.0, 180.0)
     azimuth, elevation = np.radians([random.uniform(low, high), random.uniform(32.0, 62.0)])
     direction = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     key = 0.0 if number % 5 == 4 else float(random.uniform(0.5, 1.0))
-    return RoomLight(direction, float(random.uniform(1.0, 10.0)), key)
+    return SceneLight(direction, float(random.uniform(1.0, 10.0)), key)
 
 
 def row_of(name: str, number: int, options: argparse.Namespace) -> tuple[Row, np.ndarray]:
     """Return the row of one room, and pictures of the turned toy: captured colours, relit, truth."""
     layout = SCENES[name]
     is_frontal = bool(layout.neighbours) or layout.support in ("chair", "sofa", "shelf")
-    light = room_light(number, options.seed, is_frontal=is_frontal)
+    light = light_of_scene(number, options.seed, is_frontal=is_frontal)
     scene = build_scene(name, seed=options.seed, density=options.density, light=light, device=options.device)
     axes, frame = scene.frame.axes, scene.frame
     is_flat = layout.support not in ("duvet", "grass")
@@ -62,17 +62,19 @@ def row_of(name: str, number: int, options: argparse.Namespace) -> tuple[Row, np
     ground = plane if is_flat else _height_field(scene)
     rest, background = scene.cloud.subset(scene.is_object), scene.cloud.subset(~scene.is_object)
     estimate, milliseconds = timed(estimate_light, rest, background, ground)
-    found = estimate.light
+    estimated = estimate.light
     row: Row = {"scene": name, "is_lit": light.key > 0.0, "note": estimate.note, "seconds": 1e-3 * milliseconds}
-    if found is not None:
-        cosine = float(np.clip(axes @ found.direction @ light.direction, -1.0, 1.0))
-        row |= {"degrees": float(np.degrees(np.arccos(cosine))), "shade": found.shade}
-        row |= {"half_angle": found.half_angle, "true_half_angle": light.half_angle}
+    if estimated is not None:
+        cosine = float(np.clip(axes @ estimated.direction @ light.direction, -1.0, 1.0))
+        row |= {"degrees": float(np.degrees(np.arccos(cosine))), "shade": estimated.shade}
+        row |= {"half_angle": estimated.half_angle, "true_half_angle": light.half_angle}
     size = float(np.quantile(plane.heights(rest.means.numpy()), 0.99)) * frame.scale
     turned, rotations = _turned(rest, scene, size)
-    row |= _overlaps(scene, turned, plane, size, light, found if found is not None and found.shade else None)
+    row |= _overlaps(
+        scene, turned, plane, size, light, estimated if estimated is not None and estimated.shade else None
+    )
     truth = _truth(rest, turned, scene, size, light)
-    relit = Relighter(rest, found).relight(turned, rotations) if found is not None else turned
+    relit = Relighter(rest, estimated).relight(turned, rotations) if estimated is not None else turned
     errors, shown = [], []
     for view in scene.drawn.views[1::2]:
         pictures = [render_gaussians(one, view.camera, background=(0.0, 0.0, 0.0)) for one in (turned, relit, truth)]
@@ -128,7 +130,7 @@ def _moved_solids(scene: SyntheticScene, size: float) -> list[Solid]:
 
 
 def _truth(
-    rest: GaussianCloud, turned: GaussianCloud, scene: SyntheticScene, size: float, light: RoomLight
+    rest: GaussianCloud, turned: GaussianCloud, scene: SyntheticScene, size: float, light: SceneLight
 ) -> GaussianCloud:
     """Return the turned toy with the colours that the light gives it."""
     toy, others = scene.solids
@@ -144,9 +146,14 @@ def _truth(
 
 
 def _overlaps(
-    scene: SyntheticScene, turned: GaussianCloud, plane: Plane, size: float, light: RoomLight, found: MainLight | None
+    scene: SyntheticScene,
+    turned: GaussianCloud,
+    plane: Plane,
+    size: float,
+    light: SceneLight,
+    estimated: MainLight | None,
 ) -> Row:
-    """Return the overlap of the shadow with the true one: straight below the toy, and by the light that was found."""
+    """Return the overlap of the shadow with the true one: straight below the toy, and by the light that was estimated."""
     side = np.arange(-2.4, 2.41, 0.03)
     flat = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     points = np.column_stack([flat, scene.relief(flat)])
@@ -169,7 +176,11 @@ def _overlaps(
 
     before = overlap(None)
     known = MainLight(light.direction @ scene.frame.axes, light.half_angle, 1.0, np.eye(4))
-    return {"iou_before": before, "iou": before if found is None else overlap(found), "iou_known_light": overlap(known)}
+    return {
+        "iou_before": before,
+        "iou": before if estimated is None else overlap(estimated),
+        "iou_known_light": overlap(known),
+    }
 
 
 def aims_of(rows: Sequence[Row]) -> dict[str, bool]:

@@ -25,7 +25,7 @@ from egs_warp.geometry.gaussians import ARRAYS, SH_BAND_0, GaussianCloud
 from egs_warp.render import render_gaussians
 from egs_warp.segmentation.selection_masks import masks_from_selection
 from egs_warp.segmentation.votes import MaskedView, blending_votes
-from room_solids import RoomLight
+from room_solids import SceneLight
 
 Relief = Callable[[np.ndarray], np.ndarray]
 """Heights (n,) of the ground at (n, 2) points."""
@@ -114,7 +114,7 @@ def build_scene(
     *,
     seed: int = 0,
     density: float = 1.0,
-    light: RoomLight | None = None,
+    light: SceneLight | None = None,
     device: str | None = None,
 ) -> SyntheticScene:
     """Build the room ``name`` of ``SCENES``.
@@ -246,7 +246,7 @@ def _of_solids(
     relief: Relief | None,
     density: float,
     random: np.random.Generator,
-    light: RoomLight | None,
+    light: SceneLight | None,
 ) -> dict[str, np.ndarray]:
     """Return the Gaussians of the surface of one group that is outside all other solids and above the ground."""
     parts = []
@@ -272,7 +272,7 @@ def _of_ground(
     groups: list[_SolidGroup],
     density: float,
     random: np.random.Generator,
-    light: RoomLight | None,
+    light: SceneLight | None,
 ) -> dict[str, np.ndarray]:
     """Return the Gaussians of the ground outside all solids; it is darker next to the object."""
     spacing, reach, colour = {
@@ -298,7 +298,7 @@ def _of_ground(
     return _painted(samples, albedo, _lit(samples, groups, light), random, plain=False)
 
 
-def _lit(samples: SurfaceSamples, groups: list[_SolidGroup], light: RoomLight | None) -> np.ndarray:
+def _lit(samples: SurfaceSamples, groups: list[_SolidGroup], light: SceneLight | None) -> np.ndarray:
     """Return the irradiance (n,) of surface samples."""
     if light is not None:
         return light.irradiance(samples.points, samples.normals, [one for group in groups for one in group.solids])

@@ -93,7 +93,7 @@ class Solid:
 
 
 @dataclass(frozen=True)
-class RoomLight:
+class SceneLight:
     """Ambient light and a distant light, in the room's axes."""
 
     direction: np.ndarray
