@@ -10,7 +10,7 @@ A point of the ground is in shadow if less than half of the light reaches it. Po
 solids anyway do not count.
 
 Aims: ``shadow_overlap`` (mean IoU of at least 0.6 over the lit rooms, and more than before in each), ``relit_psnr``
-(mean PSNR of the object at least 1.5 dB above that without relighting), ``clear`` (a light is estimated in at least nine
+(mean PSNR of the object at least 1.5 dB above that without relighting), ``clear`` (a light is found in at least nine
 tenths of the lit rooms, and no shadow is cast in an overcast one).
 """
 
@@ -153,7 +153,7 @@ def _overlaps(
     light: SceneLight,
     estimated: MainLight | None,
 ) -> Row:
-    """Return the overlap of the shadow with the true one: straight below the toy, and by the light that was estimated."""
+    """Return the overlap of the shadow with the true one: straight below the toy, and by the estimated light."""
     side = np.arange(-2.4, 2.41, 0.03)
     flat = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     points = np.column_stack([flat, scene.relief(flat)])

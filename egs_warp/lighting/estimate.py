@@ -28,12 +28,15 @@ _STEPS = (10.0, 5.0, 2.5)
 _ELEVATION_RANGE = (12.0, 80.0)
 _APART = 60.0
 """Difference of azimuth from which another candidate is a rival, degrees."""
-_MIN_EVIDENCE = 0.10
+_MIN_EVIDENCE = 0.18
 """Smallest decrease of the logarithm of the unexplained variance, of ground and object together, of a clear light."""
 _MAX_RIVAL = 0.80
 """Largest evidence of a rival of a clear light, relative to the best candidate."""
-_STRONG = 0.10
-"""Evidence of ground or object alone from which the two can be in conflict."""
+_MIN_AGREEMENT = 0.7
+"""Smallest evidence of the best candidate, relative to the sum of what ground and object reach alone."""
+_WEAK, _MAX_ANGLE, _SEEN = 0.4, 45.0, 0.05
+"""Below this evidence, ground and object must not point to directions that differ by more than this angle, degrees,
+where both are above the last number."""
 _MIN_SHADE = 0.04
 """Smallest fraction of displayed brightness that a cast shadow removes; a paler one is not drawn."""
 _KEY_WEIGHT = 2.0
@@ -91,10 +94,7 @@ def estimate_light(
     if best.evidence < _MIN_EVIDENCE:
         return LightEstimate(None, "light: no main light is clear; the shadow stays soft and below the creature")
     by_ground, by_shading = (max(first, key=lambda one, by=by: getattr(one, by)) for by in ("ground", "shading"))
-    is_conflict = (
-        min(by_ground.ground, by_shading.shading) > _STRONG and _azimuth_between(by_ground, by_shading) > 1.5 * _APART
-    )
-    if is_conflict or rival > _MAX_RIVAL * best.evidence:
+    if _is_conflict(best, by_ground, by_shading) or rival > _MAX_RIVAL * best.evidence:
         return LightEstimate(
             None,
             "light: shadow and shading do not agree on one direction; the shadow stays soft and below the creature",
@@ -140,6 +140,13 @@ class _Search:
             softer = [self.candidate(best.azimuth, best.elevation, angle) for angle in _HALF_ANGLES]
             best = max([best, *softer], key=lambda one: one.evidence)
         return best
+
+
+def _is_conflict(best: _Candidate, by_ground: _Candidate, by_shading: _Candidate) -> bool:
+    """Return True if the best candidates of ground and object alone contradict each other."""
+    angle = np.degrees(np.arccos(np.clip(by_ground.direction @ by_shading.direction, -1.0, 1.0)))
+    is_apart = best.evidence < _WEAK and angle > _MAX_ANGLE and min(by_ground.ground, by_shading.shading) > _SEEN
+    return is_apart or best.evidence < _MIN_AGREEMENT * (by_ground.ground + by_shading.shading)
 
 
 def _azimuth_between(first: _Candidate, second: _Candidate) -> float:
