@@ -81,10 +81,10 @@ class PlaneRecord:
     """Hole that the removed object leaves in the plane; None if there is none."""
     ground: HeightField | None = None
     """Height field of the ground if it is uneven; None if the plane is the ground."""
-    light: MainLight | None = None
-    """Main light of the capture; None if it is not clear."""
     others: Mapping[str, Any] = field(default_factory=dict)
     """Further entries of the file, which are passed on unchanged."""
+    light: MainLight | None = None
+    """Main light of the capture; None if it is not clear."""
 
     def merged_with(self, known: PlaneRecord) -> PlaneRecord:
         """Return this plane; its unknown properties are taken from ``known``."""
