@@ -1,1 +1,1 @@
-"""Kernels of the lighting."""
+"""Kernels of ``egs_warp.lighting``."""

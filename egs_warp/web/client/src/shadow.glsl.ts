@@ -28,8 +28,9 @@ function wideSample(k: number): string {
 
 export const SHADOW_GLSL = /* glsl */ `
 /* Fraction of light at uv of a shadow map. Its red channel is the part of the sky that the body hides, its green
-   channel marks the parts of the body close to the ground, its blue channel is the shadow of the main light. The shadow
-   around a contact and that of the light are spread over the radius softness. Coarser levels of the map smooth the few samples. */
+   channel marks the parts of the body close to the ground, its blue channel is the shadow of the main light. The
+   shadows around a contact and of the light are spread over the radius softness. Coarser levels of the map smooth the
+   few samples. */
 float egsShade(sampler2D shade, vec2 uv, float softness) {
   vec2 near = vec2(0.0);
   float wide = 0.0;

@@ -98,7 +98,10 @@ export function deformedSplats(
     place: dyno.dynoMat4(place, "egsPlace"),
     normals: dyno.dynoSampler2D(normals ? normalTexture(normals) : cage, "egsNormals"),
     // Zero without a main light.
-    irradiance: dyno.dynoMat4(new THREE.Matrix4().fromArray(irradiance ?? new Array<number>(16).fill(0)), "egsIrradiance"),
+    irradiance: dyno.dynoMat4(
+      new THREE.Matrix4().fromArray(irradiance ?? new Array<number>(16).fill(0)),
+      "egsIrradiance",
+    ),
     degree: dyno.dynoConst("int", degree),
     marks: dyno.dynoSampler2D(marks?.texture ?? cage, "egsMarks"),
     activeMark,

@@ -65,7 +65,10 @@ export class Viewer {
     this.splats = deformedSplats(splatsOf(header, "splats"), this.cage.texture, {
       embedding: embeddingOf(header),
       hasMarks: header.facts.picking ?? false,
-      ...(header.facts.light && { irradiance: header.facts.light.irradiance, normals: bytesOf(header, "splats_normals") }),
+      ...(header.facts.light && {
+        irradiance: header.facts.light.irradiance,
+        normals: bytesOf(header, "splats_normals"),
+      }),
     });
     this.splatRenderer = splatRenderer(this.renderer, header.facts.antialiased, () => this.invalidate());
     this.scene.add(this.splatRenderer.spark, this.splats.generator);
