@@ -35,7 +35,7 @@ _MAX_RIVAL = 0.80
 _MIN_AGREEMENT = 0.7
 """Smallest evidence of the best candidate, relative to the sum of what ground and object reach alone; each counts at
 most 1, because that of a capture without noise has no limit."""
-_WEAK, _MAX_ANGLE, _SEEN = 0.4, 45.0, 0.05
+_WEAK, _MAX_ANGLE, _MIN_ALONE = 0.4, 45.0, 0.05
 """Below this evidence, ground and object must not point to directions that differ by more than this angle, degrees,
 where both are above the last number."""
 _MIN_SHADE = 0.04
@@ -146,7 +146,7 @@ class _Search:
 def _is_conflict(best: _Candidate, by_ground: _Candidate, by_shading: _Candidate) -> bool:
     """Return True if the best candidates of ground and object alone contradict each other."""
     angle = np.degrees(np.arccos(np.clip(by_ground.direction @ by_shading.direction, -1.0, 1.0)))
-    is_apart = best.evidence < _WEAK and angle > _MAX_ANGLE and min(by_ground.ground, by_shading.shading) > _SEEN
+    is_apart = best.evidence < _WEAK and angle > _MAX_ANGLE and min(by_ground.ground, by_shading.shading) > _MIN_ALONE
     reached = min(best.ground, 1.0) + min(best.shading, 1.0)
     return is_apart or reached < _MIN_AGREEMENT * (min(by_ground.ground, 1.0) + min(by_shading.shading, 1.0))
 
