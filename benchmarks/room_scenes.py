@@ -19,11 +19,13 @@ import room_solids as solids
 from annotated_scenes import DrawnScene, DrawnView
 from egs_warp.assets.object import KEY_LIGHT
 from egs_warp.assets.surface import SurfaceSamples, flat_gaussians
+from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import ARRAYS, SH_BAND_0, GaussianCloud
 from egs_warp.render import render_gaussians
 from egs_warp.segmentation.selection_masks import masks_from_selection
 from egs_warp.segmentation.votes import MaskedView, blending_votes
+from room_solids import SceneLight
 
 Relief = Callable[[np.ndarray], np.ndarray]
 """Heights (n,) of the ground at (n, 2) points."""
@@ -95,30 +97,44 @@ class SyntheticScene:
     """Cameras of the photos."""
     drawn: DrawnScene
     """Annotated views, which are not among ``cameras``."""
+    solids: tuple[list[solids.Solid], list[solids.Solid]]
+    """Solids of the object and of everything else, in the room's axes: z up, the object at the origin."""
+    relief: Relief
+    """Ground under the object, in the room's axes."""
+    frame: BodyFrame
+    """Frame of the room in the capture."""
 
     def photos(self) -> list[np.ndarray]:
         """Render the photo (H, W, 3) float32 of each camera."""
         return [np.clip(render_gaussians(self.cloud, one).colour.numpy(), 0.0, 1.0) for one in self.cameras]
 
 
-def build_scene(name: str, *, seed: int = 0, density: float = 1.0, device: str | None = None) -> SyntheticScene:
+def build_scene(
+    name: str,
+    *,
+    seed: int = 0,
+    density: float = 1.0,
+    light: SceneLight | None = None,
+    device: str | None = None,
+) -> SyntheticScene:
     """Build the room ``name`` of ``SCENES``.
 
     Args:
         name: name of the room.
         seed: seed of everything that is random: folds, textures, defects, cameras, frame.
         density: factor of the number of Gaussians.
+        light: light that shades all surfaces and casts shadows; None for a fixed one without shadows.
         device: Warp device.
     """
     layout, random = SCENES[name], np.random.default_rng([seed, list(SCENES).index(name)])
     relief = _relief(layout.support, random)
     groups = _solid_groups(layout, relief)
-    parts = [_of_solids(groups, number, relief, density, random) for number in range(len(groups))]
+    parts = [_of_solids(groups, number, relief, density, random, light) for number in range(len(groups))]
     if relief is not None:
-        parts.append(_of_ground(layout.support, relief, groups, density, random))
+        parts.append(_of_ground(layout.support, relief, groups, density, random, light))
     if layout.support in _FLOOR:
         level = _FLOOR[layout.support]
-        parts.append(_of_ground("floor", lambda points: np.full(len(points), level), groups, density, random))
+        parts.append(_of_ground("floor", lambda points: np.full(len(points), level), groups, density, random, light))
     fields = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     is_object = np.repeat([number == 0 for number in range(len(parts))], [len(part["means"]) for part in parts])
     _bridge(fields, is_object, random)
@@ -132,12 +148,14 @@ def build_scene(name: str, *, seed: int = 0, density: float = 1.0, device: str |
     whole = [MaskedView(one, np.ones((one.height, one.width), bool), "photo") for one in cameras]
     kept = blending_votes(cloud, whole).inside > 0.0
     kept |= random.uniform(size=len(kept)) < _UNSEEN_SHARE
-    cloud, cameras = _in_any_frame(cloud.subset(kept), cameras, random)
+    cloud, cameras, frame = _in_any_frame(cloud.subset(kept), cameras, random)
     is_object = is_object[kept]
     chosen = np.linspace(0, len(cameras) - 1, VIEWS).round().astype(int)
     drawn = DrawnScene(name, None, None, tuple(_annotated(cloud, is_object, cameras[k]) for k in chosen))
     photos = tuple(camera for k, camera in enumerate(cameras) if k not in chosen)
-    return SyntheticScene(name, cloud, is_object, photos, drawn)
+    others = [one for group in groups[1:] for one in group.solids]
+    ground = relief if relief is not None else lambda points: np.zeros(len(points))
+    return SyntheticScene(name, cloud, is_object, photos, drawn, (groups[0].solids, others), ground, frame)
 
 
 def _annotated(cloud: GaussianCloud, is_object: np.ndarray, camera: Camera) -> DrawnView:
@@ -223,7 +241,12 @@ def _relief(support: str, random: np.random.Generator) -> Relief | None:
 
 
 def _of_solids(
-    groups: list[_SolidGroup], number: int, relief: Relief | None, density: float, random: np.random.Generator
+    groups: list[_SolidGroup],
+    number: int,
+    relief: Relief | None,
+    density: float,
+    random: np.random.Generator,
+    light: SceneLight | None,
 ) -> dict[str, np.ndarray]:
     """Return the Gaussians of the surface of one group that is outside all other solids and above the ground."""
     parts = []
@@ -238,12 +261,18 @@ def _of_solids(
             visible &= samples.points[:, 2] > relief(samples.points[:, :2])
         if visible.any():
             samples = SurfaceSamples(samples.points[visible], samples.normals[visible], spacing)
-            parts.append(_painted(samples, np.array(one.colour), random, plain=own.spacing > 0.07))
+            lit = _lit(samples, groups, light)
+            parts.append(_painted(samples, np.array(one.colour), lit, random, plain=own.spacing > 0.07))
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
 def _of_ground(
-    kind: str, relief: Relief, groups: list[_SolidGroup], density: float, random: np.random.Generator
+    kind: str,
+    relief: Relief,
+    groups: list[_SolidGroup],
+    density: float,
+    random: np.random.Generator,
+    light: SceneLight | None,
 ) -> dict[str, np.ndarray]:
     """Return the Gaussians of the ground outside all solids; it is darker next to the object."""
     spacing, reach, colour = {
@@ -264,16 +293,24 @@ def _of_ground(
     pattern = {"duvet": 4.0, "grass": 9.0, "carpet": 7.0, "floor": 2.0}[kind]
     stripes = 1.0 + 0.25 * np.sin(pattern * samples.points[:, :1]) * np.sin(0.7 * pattern * samples.points[:, 1:2])
     away = np.linalg.norm(samples.points - [0.0, 0.0, 0.2], axis=1)[:, None]
-    shadow = 1.0 - 0.5 * np.exp(-((away / 0.55) ** 2))
-    return _painted(samples, np.array(colour) * stripes * shadow, random, plain=False)
+    shadow = 1.0 - (0.5 if light is None else 0.25) * np.exp(-((away / 0.55) ** 2))
+    albedo = np.array(colour) * stripes * shadow
+    return _painted(samples, albedo, _lit(samples, groups, light), random, plain=False)
+
+
+def _lit(samples: SurfaceSamples, groups: list[_SolidGroup], light: SceneLight | None) -> np.ndarray:
+    """Return the irradiance (n,) of surface samples."""
+    if light is not None:
+        return light.irradiance(samples.points, samples.normals, [one for group in groups for one in group.solids])
+    key = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
+    return 0.45 + 0.35 * np.clip(samples.normals @ key, 0.0, None) + 0.2 * np.clip(samples.normals[:, 2], 0.0, None)
 
 
 def _painted(
-    samples: SurfaceSamples, albedo: np.ndarray, random: np.random.Generator, *, plain: bool
+    samples: SurfaceSamples, albedo: np.ndarray, lit: np.ndarray, random: np.random.Generator, *, plain: bool
 ) -> dict[str, np.ndarray]:
-    """Return the arrays of flat Gaussians of one surface; on a ``plain`` one they are alike in colour."""
-    light = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
-    lit = 0.45 + 0.35 * np.clip(samples.normals @ light, 0.0, None) + 0.2 * np.clip(samples.normals[:, 2], 0.0, None)
+    """Return the arrays of flat Gaussians of one surface with irradiance ``lit`` (n,); on a ``plain`` one they are
+    alike in colour."""
     noise = random.normal(1.0, 0.02 if plain else 0.10, (len(samples.points), 1))
     colour = np.clip(1.3 * albedo * lit[:, None] * noise, 0.0, 1.0) ** (1.0 / 2.2)
     cloud = flat_gaussians(samples, ((colour - 0.5) / SH_BAND_0)[:, None], random=random, device="cpu")
@@ -363,8 +400,8 @@ def _camera(layout: SceneLayout, random: np.random.Generator) -> Camera:
 
 def _in_any_frame(
     cloud: GaussianCloud, cameras: list[Camera], random: np.random.Generator
-) -> tuple[GaussianCloud, list[Camera]]:
-    """Return the capture and its cameras in an arbitrary frame and unit of length."""
+) -> tuple[GaussianCloud, list[Camera], BodyFrame]:
+    """Return the capture and its cameras in an arbitrary frame and unit of length, and the room's frame in it."""
     turn = Rotation.random(rng=random)
     scale, shift = float(random.uniform(0.4, 2.5)), random.normal(size=3)
     rotations = turn * Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]])
@@ -387,4 +424,4 @@ def _in_any_frame(
                 near=scale * camera.near,
             )
         )
-    return moved, seen
+    return moved, seen, BodyFrame(turn.as_matrix().T, shift, 1.0 / scale)

@@ -13,6 +13,13 @@ from egs_warp.assets.surface import SurfaceSamples
 
 Colour = tuple[float, float, float]
 
+_AMBIENT, _SKY = 0.35, 0.2
+"""Irradiance from all sides, and that from above in addition."""
+_RAYS = 16
+"""Rays to the disc of a light."""
+_OFFSET = 0.02
+"""Distance of a ray's origin from its surface; Gaussians lie up to a quarter of their spacing below theirs."""
+
 
 @dataclass(frozen=True)
 class Solid:
@@ -32,6 +39,18 @@ class Solid:
         """(n,) bool, True for ``points`` (n, 3) inside."""
         local = (points - self.centre) @ self.turn / self.half
         return np.abs(local).max(axis=1) < 1.0 if self.is_box else (local**2).sum(axis=1) < 1.0
+
+    def is_hit(self, origins: np.ndarray, ray: np.ndarray) -> np.ndarray:
+        """(n,) bool, True where the half-line from ``origins`` (n, 3) along ``ray`` (3,) meets the solid."""
+        start, along = (origins - self.centre) @ self.turn / self.half, ray @ self.turn / self.half
+        if self.is_box:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ends = np.sort(np.stack([(-1.0 - start) / along, (1.0 - start) / along]), axis=0)
+            enter, leave = ends[0].max(axis=1), ends[1].min(axis=1)
+            return (enter <= leave) & (leave > 0.0)
+        a, b, c = along @ along, start @ along, (start * start).sum(axis=1) - 1.0
+        root = b * b - a * c
+        return (root > 0.0) & (-b + np.sqrt(np.maximum(root, 0.0)) > 0.0)
 
     def samples(self, spacing: float, random: np.random.Generator) -> SurfaceSamples:
         """Return points spread evenly over the surface, about ``spacing`` (scene units) apart."""
@@ -71,6 +90,41 @@ class Solid:
         by ``shift`` (3,)."""
         turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
         return replace(self, centre=scale * turn @ self.centre + shift, half=scale * self.half, turn=turn @ self.turn)
+
+
+@dataclass(frozen=True)
+class SceneLight:
+    """Ambient light and a distant light, in the room's axes."""
+
+    direction: np.ndarray
+    """(3,) unit vector to the light."""
+    half_angle: float
+    """Degrees."""
+    key: float
+    """Irradiance of a surface that faces it."""
+
+    def visible(self, points: np.ndarray, normals: np.ndarray, solids: Sequence[Solid]) -> np.ndarray:
+        """Return the fraction (n,) of the light's disc that reaches ``points`` (n, 3) with ``normals`` (n, 3)."""
+        first = np.cross(self.direction, [0.3, 0.5, 0.8])
+        first /= np.linalg.norm(first)
+        second = np.cross(self.direction, first)
+        numbers = np.arange(_RAYS)
+        radii = np.tan(np.radians(self.half_angle)) * np.sqrt((numbers + 0.5) / _RAYS)
+        angles = 2.399963 * numbers
+        origins, seen = points + _OFFSET * normals, np.zeros(len(points))
+        for radius, angle in zip(radii, angles, strict=True):
+            ray = self.direction + radius * (np.cos(angle) * first + np.sin(angle) * second)
+            free = np.ones(len(points), bool)
+            for one in solids:
+                free &= ~one.is_hit(origins, ray)
+            seen += free
+        return seen / _RAYS
+
+    def irradiance(self, points: np.ndarray, normals: np.ndarray, solids: Sequence[Solid]) -> np.ndarray:
+        """Return the irradiance (n,) of surface points (n, 3) between ``solids``."""
+        ambient = _AMBIENT + _SKY * np.clip(normals[:, 2], 0.0, None)
+        cosine = np.clip(normals @ self.direction, 0.0, None)
+        return ambient + self.key * cosine * self.visible(points, normals, solids)
 
 
 def ellipsoid(centre: Sequence[float], half: Sequence[float], colour: Colour, *, tilt: float = 0.0) -> Solid:

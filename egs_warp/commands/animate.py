@@ -163,6 +163,12 @@ def add_parser(commands: Commands) -> None:
         help="direction from the object to the camera, in the capture's frame: x,y,z or an axis, as --view-from=-y",
     )
     camera.add_argument("--no-shadow", action="store_true", help="draw no shadow under the object")
+    camera.add_argument(
+        "--no-light",
+        action="store_true",
+        help="keep the captured colours and draw a soft shadow straight below the object, also where the capture shows"
+        " a main light (docs/concepts/light.md)",
+    )
     run = animate.add_argument_group("run and solver")
     add_overwrite_flag(run, "--out")
     add_config_flag(run)
@@ -220,7 +226,7 @@ def run_animate(args: argparse.Namespace) -> int:
 
 def _animate_capture(args: argparse.Namespace) -> Report:
     """Animate a capture that contains only the object."""
-    from egs_warp.commands.scene_input import ground_of, plane_of
+    from egs_warp.commands.scene_input import ground_of, light_of, plane_of
     from egs_warp.io import read_capture
     from egs_warp.io.video import ffmpeg_program
 
@@ -246,6 +252,7 @@ def _animate_capture(args: argparse.Namespace) -> Report:
         view_from=view_from,
         notes=notes,
         creature=replace(options.creature, ground=ground_of(args.plane, flat=args.flat)),
+        light=None if args.no_light else light_of(args.plane),
     )
     return _animate_whole(args, capture.cloud, options, up=up, plane=plane, background=background)
 
@@ -296,6 +303,7 @@ def _animate_scene(args: argparse.Namespace) -> Report:
                 options,
                 view_from=view_from if view_from is not None else viewing_directions(scene, scene_input.cameras),
                 notes=(*scene_input.notes, *scene.notes),
+                light=None if args.no_light else scene.light,
                 creature=replace(
                     options.creature,
                     ground=scene.ground,

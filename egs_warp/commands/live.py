@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from egs_warp.commands.scene_input import SceneInput
     from egs_warp.geometry.gaussians import GaussianCloud
     from egs_warp.geometry.height_field import HeightField
+    from egs_warp.geometry.main_light import MainLight
     from egs_warp.geometry.plane import Plane
     from egs_warp.web.session import Session
 
@@ -128,6 +129,8 @@ class _Source:
     background: GaussianCloud | None = None
     scene: SceneInput | None = None
     """Scene of the object; None if the capture is the object."""
+    light: MainLight | None = None
+    """Main light, in the axes of the capture; None if it is not clear."""
 
     def prepared(self, begin_stage: Callable[[str], object]) -> _Source:
         """Return the object, separated from its scene."""
@@ -138,12 +141,12 @@ class _Source:
         scene = self.scene.prepared(SceneOptions(), begin_stage=begin_stage)
         for note in scene.notes:
             print_note(note)
-        return _Source(scene.object, None, scene.plane, self.front, scene.ground, scene.background)
+        return _Source(scene.object, None, scene.plane, self.front, scene.ground, scene.background, light=scene.light)
 
 
 def _read_capture(args: argparse.Namespace) -> _Source:
     """Read a capture that contains only the object."""
-    from egs_warp.commands.scene_input import ground_of, plane_of
+    from egs_warp.commands.scene_input import ground_of, light_of, plane_of
     from egs_warp.io import read_capture
 
     check_no_scene_flags(args)
@@ -159,7 +162,8 @@ def _read_capture(args: argparse.Namespace) -> _Source:
         print_note(note)
     front = parse_direction("front", args.front) if args.front is not None else None
     behind = background.cloud_aligned_with(capture) if background is not None else None
-    return _Source(capture.cloud, up, plane, front, ground_of(args.plane, flat=False), behind)
+    ground, light = ground_of(args.plane, flat=False), light_of(args.plane)
+    return _Source(capture.cloud, up, plane, front, ground, behind, light=light)
 
 
 def _read_scene(args: argparse.Namespace) -> _Source:
@@ -211,7 +215,7 @@ def _session(args: argparse.Namespace, source: _Source, *, begin_stage: Callable
 
         creature = make_creature(source.cloud, up=source.up, plane=source.plane, options=options, progress=begins)
         begins("split")
-        drawn_as = live_render_data(creature, presplit_gaussians(creature))
+        drawn_as = live_render_data(creature, presplit_gaussians(creature), light=source.light)
     if source.front is None:
         print_note(creature.front.description(creature.frame))
     session_options = SessionOptions(source=Path(args.capture).name, takes=args.out, muscles_file=args.muscles)

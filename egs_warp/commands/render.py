@@ -38,6 +38,11 @@ def add_parser(commands: Commands) -> None:
         help="colour (default); depth, near is white, in PNGs as 16-bit millimetres; or alpha",
     )
     render.add_argument("--no-shadow", action="store_true", help="draw no shadow under the object")
+    render.add_argument(
+        "--no-light",
+        action="store_true",
+        help="keep the captured colours and draw a soft shadow straight below the object (docs/concepts/light.md)",
+    )
     render.set_defaults(run=_render)
 
 
@@ -49,6 +54,14 @@ def _render(args: argparse.Namespace) -> int:
     shot, background = shot_of(args)
     use_device("cpu")
     run = FinishedRun.read(args.folder, background=Path(background) if background is not None else None)
-    count = render_run(run, args.out, shot, show=Show(args.show), hold=args.turntable, shadow=not args.no_shadow)
+    count = render_run(
+        run,
+        args.out,
+        shot,
+        show=Show(args.show),
+        hold=args.turntable,
+        shadow=not args.no_shadow,
+        light=not args.no_light,
+    )
     print(f"wrote {args.out} ({count} frames)")
     return 0

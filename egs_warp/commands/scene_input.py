@@ -17,6 +17,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
+from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.cameras import PosedImage, read_posed_images
 from egs_warp.io.capture import read_capture
@@ -124,6 +125,13 @@ def ground_of(text: str | None, *, flat: bool) -> HeightField | None:
     if flat or text is None or not (text.endswith(".json") or Path(text).is_file()):
         return None
     return read_planes(text)[0].ground
+
+
+def light_of(text: str | None) -> MainLight | None:
+    """Return the main light of the first plane of a plane.json; None if it has none."""
+    if text is None or not (text.endswith(".json") or Path(text).is_file()):
+        return None
+    return read_planes(text)[0].light
 
 
 def read_scene(args: argparse.Namespace) -> SceneInput:

@@ -12,6 +12,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.height_field import HeightField, check_grid
+from egs_warp.geometry.main_light import MainLight, check_light
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import MAX_COORDINATE, MAX_TEXT_BYTES, read_bytes
@@ -82,6 +83,8 @@ class PlaneRecord:
     """Height field of the ground if it is uneven; None if the plane is the ground."""
     others: Mapping[str, Any] = field(default_factory=dict)
     """Further entries of the file, which are passed on unchanged."""
+    light: MainLight | None = None
+    """Main light of the capture; None if it is not clear."""
 
     def merged_with(self, known: PlaneRecord) -> PlaneRecord:
         """Return this plane; its unknown properties are taken from ``known``."""
@@ -98,6 +101,8 @@ class PlaneRecord:
             facts["hole"] = self.hole.to_json()
         if self.ground is not None:
             facts["ground"] = _ground_to_json(self.ground)
+        if self.light is not None:
+            facts["light"] = _light_to_json(self.light)
         return {"normal": self.plane.normal.tolist(), "offset": self.plane.offset, **facts, **self.others}
 
     @classmethod
@@ -124,6 +129,7 @@ class PlaneRecord:
                 pixels=int(entry["pixels"]) if "pixels" in entry else None,
                 hole=HoleOutline.from_json(entry["hole"], path) if "hole" in entry else None,
                 ground=_ground_from_json(entry["ground"], path) if "ground" in entry else None,
+                light=_light_from_json(entry["light"], path) if "light" in entry else None,
                 others={name: value for name, value in entry.items() if name not in ("normal", "offset", *_FACTS)},
             )
         except (TypeError, ValueError, OverflowError) as error:
@@ -156,6 +162,30 @@ def _ground_from_json(entry: Any, path: Path) -> HeightField:
     except (TypeError, KeyError, ValueError, OverflowError, AttributeError, UserError) as error:
         raise UserError(f"{path}: its ground is damaged; make it again with egs-warp segment") from error
     return ground
+
+
+def _light_to_json(light: MainLight) -> dict[str, Any]:
+    return {
+        "direction": light.direction.tolist(),
+        "half_angle": light.half_angle,
+        "shade": light.shade,
+        "irradiance": light.irradiance.tolist(),
+    }
+
+
+def _light_from_json(entry: Any, path: Path) -> MainLight:
+    """Inverse of ``_light_to_json``. Raises ``UserError`` for invalid data."""
+    try:
+        light = MainLight(
+            np.array(entry["direction"], dtype=float).reshape(3),
+            float(entry["half_angle"]),
+            float(entry["shade"]),
+            np.array(entry["irradiance"], dtype=float).reshape(4, 4),
+        )
+        check_light(light)
+    except (TypeError, KeyError, ValueError, OverflowError, AttributeError) as error:
+        raise UserError(f"{path}: its light is damaged; make it again with egs-warp segment") from error
+    return light
 
 
 _NUMBERS = ("size", "noise", "inlier_share", "support")

@@ -11,6 +11,7 @@ import numpy as np
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
+from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
@@ -76,6 +77,9 @@ class AnimateOptions:
     """Width and height of the video, pixels, if ``shot`` has no size and it is no preview."""
     shadow: bool = True
     """Draw a shadow on the ground under the object."""
+    light: MainLight | None = None
+    """Main light, in the axes of the capture, by which the creature is relit and casts its shadow (``prepare_scene``);
+    None keeps the captured colours, and the shadow is straight below the object."""
     preview: bool = False
     """Draw at most ``PREVIEW_GAUSSIANS`` Gaussians, and at most ``PREVIEW_SIZE`` pixels if ``shot`` has no size."""
     view_from: Direction | None = None
@@ -140,6 +144,7 @@ class AnimateOptions:
             "metres_per_unit": creature.metres_per_unit,
             "friction": creature.friction,
             "shadow": self.shadow,
+            "light": self.light is not None,
             "preview": self.preview,
             "get_up": self.get_up,
             "retakes": self.retakes,
@@ -265,10 +270,14 @@ def animate(
             background=background,
             view_from=view_from,
             shadow=options.shadow,
+            light=options.light,
             max_gaussians=PREVIEW_GAUSSIANS if options.preview else None,
             quiet=quiet,
         )
-        render_data_of_run = RenderData.of(film.splats, film.camera, creature.muscles, performance.place.feet())
+        light = None if options.light is None else options.light.rotated(creature.frame.axes)
+        render_data_of_run = RenderData.of(
+            film.splats, film.camera, creature.muscles, performance.place.feet(), light=light
+        )
         render_data_of_run.save(run.file(render_data.FILE), deformer=film.deformer)
         simulation = performance.simulation
         placed_background = creature.placed(background) if background is not None else None

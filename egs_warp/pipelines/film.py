@@ -18,8 +18,11 @@ from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_camera
 from egs_warp.geometry.gaussians import GaussianCloud, hidden_below, most_visible
+from egs_warp.geometry.main_light import MainLight
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.io.video import VideoWriter, contact_sheet, write_png
+from egs_warp.lighting.relighting import Relighter
+from egs_warp.lighting.remaining_shadow import without_shadow
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.creature import Creature
@@ -91,6 +94,7 @@ def draw_film(
     background: GaussianCloud | None = None,
     view_from: np.ndarray | None = None,
     shadow: bool = True,
+    light: MainLight | None = None,
     max_gaussians: int | None = None,
     quiet: bool = False,
 ) -> Film:
@@ -106,13 +110,18 @@ def draw_film(
         view_from: (3,) direction from the object to the camera, in the capture's frame; of several (n, 3) the best is
             chosen.
         shadow: Draw a shadow on the ground.
+        light: Main light, in the axes of the capture, by which the creature is relit and casts its shadow; None keeps
+            the captured colours, and the shadow is straight below the creature.
         max_gaussians: Draw only the most visible Gaussians of the creature, at most this many; None draws all.
         quiet: Show no progress bar.
     """
     creature, simulation = performance.creature, performance.simulation
     trajectory, shot = simulation.trajectory, shot or Shot()
     steps = simulation.frames if shot.fps == FRAME_RATE else nearest_steps(trajectory.time, shot.fps)
+    placed_light = None if light is None else light.rotated(creature.frame.axes)
     scene = creature.placed(background) if background is not None else None
+    if scene is not None and placed_light is not None and shadow:
+        scene = without_shadow(scene, creature.cloud, creature.geometry.field or GROUND, placed_light)
     camera = resized(performance.camera(size, view_from, scene=scene), *(shot.size or (size, size)))
     cameras = shot.cameras(camera, trajectory, steps, in_scene=scene is not None)
     # The whole motion is known, so Gaussians are split before the first frame and no frame shows a sudden change.
@@ -137,6 +146,7 @@ def draw_film(
         shot,
         scene=scene,
         shadow=shadow,
+        light=placed_light,
     )
     milliseconds: dict[str, list[float]] = {"deform": [], "render": [], "encode": []}
     sheet_images: list[np.ndarray] = []
@@ -171,6 +181,7 @@ def drawn_frames(
     *,
     scene: GaussianCloud | None = None,
     shadow: bool = True,
+    light: MainLight | None = None,
 ) -> Iterator[Frame]:
     """Render one frame for each step of the trajectory. The backdrop is reused while the camera stays the same.
 
@@ -182,21 +193,24 @@ def drawn_frames(
         shot: Background colour and transparency.
         scene: Gaussians behind the creature, in the frame of the body.
         shadow: Draw a shadow on the ground.
+        light: Main light, in the axes of the body; None as for ``draw_film``.
     """
     path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
     grain, device = shadow_blur_radius(deformer.rest), deformer.rest.device
     # Below the level of uneven ground, whose shape is not drawn, the creature is visible.
     is_flat = trajectory.ground_coefficients.size == 0
+    relighter = None if light is None else Relighter(deformer.rest, light)
     setting: Backdrop | None = None
     for index, (step, camera) in enumerate(zip(steps, cameras, strict=True)):
         marks = [time.perf_counter()]
         deformed = deformer.deform(trajectory.positions[step])
+        cloud = deformed.cloud if relighter is None else relighter.relight(deformed.cloud, deformed.rotations)
         marks.append(time.perf_counter())
         if setting is None or camera is not cameras[index - 1]:
             setting = _backdrop_of(
-                path, trajectory.height, camera, scene, shot, grain=grain, shadow=shadow, device=device
+                path, trajectory.height, camera, scene, shot, grain=grain, shadow=shadow, light=light, device=device
             )
-        image, shade = _rendered(deformed.cloud, setting, transparent=shot.transparent, has_floor=is_flat)
+        image, shade = _rendered(cloud, setting, transparent=shot.transparent, has_floor=is_flat)
         marks.append(time.perf_counter())
         deforming, rendering = (1e3 * np.diff(marks)).tolist()
         yield Frame(image, shade, (deforming, rendering))
@@ -230,7 +244,9 @@ def picture_seconds(creature: Creature, *, size: tuple[int, int], shadow: bool =
     camera = framed(resized(camera, *size), positions)
     deformer = Deformer(creature.cloud, embed_gaussians(creature.cloud, creature.cage.mesh))
     grain, path = shadow_blur_radius(creature.cloud), creature.body.centre_of_mass(positions)[None]
-    setting = _backdrop_of(path, height, camera, None, Shot(), grain=grain, shadow=shadow, device=creature.cloud.device)
+    setting = _backdrop_of(
+        path, height, camera, None, Shot(), grain=grain, shadow=shadow, light=None, device=creature.cloud.device
+    )
     spent = []
     # The first picture may compile kernels.
     for _ in range(2):
@@ -261,6 +277,7 @@ def _backdrop_of(
     *,
     grain: float,
     shadow: bool,
+    light: MainLight | None,
     device: wp.Device,
 ) -> Backdrop:
     """Return the backdrop of a shot.
@@ -273,6 +290,7 @@ def _backdrop_of(
         shot: Background colour and transparency.
         grain: Blur radius of the shadow.
         shadow: Draw a shadow on the ground.
+        light: Main light, in the axes of the body; None for a shadow straight down.
         device: Warp device.
     """
     com = path.mean(axis=0)
@@ -281,9 +299,24 @@ def _backdrop_of(
     is_plain = shot.transparent or shot.colour is not None
     if scene is not None and not is_plain:
         return captured_scene(
-            scene, camera, GROUND, centre=centre, reach=reach, blur_radius=grain, height=height, shadow=shadow
+            *(scene, camera, GROUND),
+            centre=centre,
+            reach=reach,
+            blur_radius=grain,
+            height=height,
+            light=light,
+            shadow=shadow,
         )
-    ground = ContactShadow(camera, GROUND, centre=centre, reach=reach, device=device, blur_radius=grain, height=height)
+    ground = ContactShadow(
+        camera,
+        GROUND,
+        centre=centre,
+        reach=reach,
+        device=device,
+        blur_radius=grain,
+        height=height,
+        light=light,
+    )
     if is_plain:
         return plain_colour(ground, shot.colour or (0.0, 0.0, 0.0), shadow=shadow)
     return studio_floor(ground, cell=0.25 * height, shadow=shadow)

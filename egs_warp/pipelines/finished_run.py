@@ -13,13 +13,16 @@ from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError, UserError
-from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
+from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.arrays import READ_ERRORS
 from egs_warp.io.capture import read_capture
 from egs_warp.io.run_folder import CONFIG, is_interrupted
 from egs_warp.io.text import parse_json, read_text
+from egs_warp.lighting.remaining_shadow import without_shadow
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.locomotion.trajectory_validation import check_trajectory
@@ -131,6 +134,21 @@ class FinishedRun:
     def deformer(self) -> Deformer:
         """Create the deformer that moves the creature's Gaussians to node positions, as the film did."""
         return Deformer(self.creature.splats, embed_gaussians(self.creature.splats, self.mesh))
+
+    def scene_without_shadow(self) -> GaussianCloud | None:
+        """Return the scene without the shadow that the object cast in it; None if there is no scene."""
+        light = self.creature.light
+        if self.scene is None or light is None:
+            return self.scene
+        return without_shadow(self.scene, self.creature.splats, self.ground, light)
+
+    @property
+    def ground(self) -> Plane | HeightField:
+        """Ground under the creature, in the frame of the body."""
+        t = self.trajectory
+        if t.ground_coefficients.size == 0:
+            return GROUND
+        return HeightField(t.ground_axes, t.ground_origin, t.ground_spacing, t.ground_coefficients)
 
     @property
     def capture_frame(self) -> BodyFrame:

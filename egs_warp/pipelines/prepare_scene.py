@@ -15,12 +15,14 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
 from egs_warp.geometry.height_field import HeightField
+from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, hole_under
 from egs_warp.inpainting.underside import with_underside
 from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
+from egs_warp.lighting.estimate import estimate_light
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
 from egs_warp.segmentation.clearance import StraddlingOptions, StraddlingPolicy, clear_plane, plane_extents
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -96,6 +98,8 @@ class PreparedScene:
     """Notes on the stages, for the user."""
     filled: InpaintResult | None = None
     """Result of the inpainting; None if there was none."""
+    light: MainLight | None = None
+    """Main light of the capture; None if it is not clear."""
 
     @property
     def ground(self) -> HeightField | None:
@@ -112,7 +116,7 @@ class PreparedScene:
         file_path = out.file if isinstance(out, RunFolder) else out.joinpath
         write_ply(file_path("object.ply"), self.object)
         write_ply(file_path("background.ply"), self.background)
-        first = replace(self.located.known(), hole=self.hole.outline() if self.hole else None)
+        first = replace(self.located.known(), hole=self.hole.outline() if self.hole else None, light=self.light)
         write_planes(file_path("plane.json"), [first.merged_with(known[0]) if known else first, *known[1:]])
 
 
@@ -156,6 +160,9 @@ def prepare_scene(
     )
     object_cloud, snap_notes = snap_to_plane(object_cloud, located)
     notes = (*notes, *snap_notes)
+    # Measured before the hole is filled: the fill replaces a part of the shadow.
+    lighting = estimate_light(object_cloud, background_with_hole, located.ground or located.plane)
+    notes = (*notes, lighting.note)
     filled, hole = None, hole_under(cloud, located.plane, located.segmentation)
     if options.inpaint and hole is None:
         notes = (*notes, "the object hangs above the ground, which is whole under it")
@@ -178,7 +185,9 @@ def prepare_scene(
             notes = (*notes, f"the floor under the object was not filled ({error})")
     background = background_with_hole if filled is None else filled.cloud
     return PreparedScene(
-        object_cloud, background, background_with_hole, located.plane, hole, located, (*located.notes, *notes), filled
+        *(object_cloud, background, background_with_hole, located.plane, hole, located, (*located.notes, *notes)),
+        filled=filled,
+        light=lighting.light,
     )
 
 

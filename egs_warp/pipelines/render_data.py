@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from egs_warp.deformation.deformer import Deformer
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
+from egs_warp.geometry.main_light import MainLight, check_light
 from egs_warp.io.arrays import READ_ERRORS, read_npz
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import MAX_COORDINATE, check_pixels
@@ -22,6 +23,7 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.short_repr import short_repr
 
 FILE = "creature.npz"
+_LIGHT = ("direction", "half_angle", "shade", "irradiance")
 _CAMERA = ("rotation", "translation", "width", "height", "fx", "fy", "cx", "cy", "near", "far")
 
 
@@ -52,10 +54,20 @@ class RenderData:
     """(F,) Kind of each fibre (``FibreKind``)."""
     foot_from_node: np.ndarray
     """(N,) int32, foot whose sole a node belongs to, -1 for other nodes."""
+    light: MainLight | None = None
+    """Main light of the film, in the axes of the body; None if it was drawn without one."""
 
     @classmethod
-    def of(cls, splats: GaussianCloud, camera: Camera, muscles: MuscleSet, feet: Sequence[Foot] = ()) -> RenderData:
-        """Create the record from Gaussians and camera of a film, and muscles and feet of the body."""
+    def of(
+        cls,
+        splats: GaussianCloud,
+        camera: Camera,
+        muscles: MuscleSet,
+        feet: Sequence[Foot] = (),
+        *,
+        light: MainLight | None = None,
+    ) -> RenderData:
+        """Create the record from Gaussians, camera and light of a film, and muscles and feet of the body."""
         foot_from_node = np.full(muscles.node_count, -1, np.int32)
         for index, foot in enumerate(feet):
             foot_from_node[foot.sole] = index
@@ -69,6 +81,7 @@ class RenderData:
             muscles.fibre_names,
             tuple(kind.value for kind in muscles.fibre_kinds),
             foot_from_node,
+            light,
         )
 
     def save(self, path: Path, *, deformer: Deformer | None = None) -> None:
@@ -93,6 +106,8 @@ class RenderData:
             "fibre_kinds": np.array(self.fibre_kinds, dtype=np.str_),
             "foot_from_node": self.foot_from_node,
         }
+        if self.light is not None:
+            arrays |= {f"light_{name}": np.asarray(getattr(self.light, name)) for name in _LIGHT}
         if deformer is not None:
             arrays |= {**deformer.plan_arrays(), "max_stretch": np.float64(deformer.max_stretch)}
         with atomic_write(path) as temporary, temporary.open("wb") as stream:
@@ -123,6 +138,7 @@ class RenderData:
                 tuple(map(str, arrays["fibre_names"])),
                 tuple(map(str, arrays["fibre_kinds"])),
                 arrays["foot_from_node"],
+                _light_from(arrays),
             )
             data._check(node_count)
         except FileNotFoundError as error:
@@ -154,6 +170,16 @@ class RenderData:
             raise ValueError("muscle_bounds has a wrong shape or values that are not finite")
         if not (np.abs(ends.data) <= MAX_COORDINATE).all():
             raise ValueError("muscle_end_weights has values that are too large or not finite")
+
+
+def _light_from(arrays: Mapping[str, np.ndarray]) -> MainLight | None:
+    """Return the light of a file; None if it has none. Raises ``ValueError`` for an invalid one."""
+    if "light_direction" not in arrays:
+        return None
+    direction, half_angle, shade, irradiance = (np.asarray(arrays[f"light_{name}"], float) for name in _LIGHT)
+    light = MainLight(direction.reshape(3), float(half_angle), float(shade), irradiance.reshape(4, 4))
+    check_light(light)
+    return light
 
 
 def _check_rows(name: str, values: np.ndarray, shape: tuple[int, ...], minimum: int, below: int) -> None:

@@ -41,6 +41,7 @@ def render_run(
     show: Show = Show.COLOUR,
     hold: int | None = None,
     shadow: bool = True,
+    light: bool = True,
     quiet: bool = False,
 ) -> int:
     """Write a video, or a folder of PNGs, of a finished run. Equal arguments give equal pictures.
@@ -52,6 +53,7 @@ def render_run(
         show: Quantity to show.
         hold: Freeze this frame, counted at 60 Hz, while the camera moves around it once; None shows the motion.
         shadow: Draw a shadow on the ground.
+        light: Use the main light of the run, if it has one.
         quiet: Show no progress bar.
 
     Returns:
@@ -75,7 +77,9 @@ def render_run(
         steps = np.full(turntable(shot.fps), run.steps[run.frame_number(hold, argument="turntable")])
         base = resized(run.creature.camera, *(shot.size or (run.creature.camera.width, run.creature.camera.height)))
         cameras = around(base, t.positions[steps[:1]], count=len(steps))
-    frames = drawn_frames(run.deformer(), t, steps, cameras, shot, scene=run.scene, shadow=shadow)
+    main_light = run.creature.light if light else None
+    scene = run.scene_without_shadow() if light and shadow else run.scene
+    frames = drawn_frames(run.deformer(), t, steps, cameras, shot, scene=scene, shadow=shadow, light=main_light)
     corners = t.positions[steps] if hold is None else t.positions[steps[:1]]
     near, far = _depths(corners.reshape(-1, 3), cameras) if show is Show.DEPTH else (0.0, 1.0)
     pictures = frame_paths(out, range(len(steps)), ".png") if folder else []

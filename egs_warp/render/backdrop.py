@@ -12,6 +12,7 @@ import warp as wp
 
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.render import backdrop as kernels
 from egs_warp.launching import empty, launch_rows
@@ -41,8 +42,8 @@ class Backdrop:
     unshadowed: wp.array
     """(H W,) vec3, background colour without the shadow."""
     shadow: ContactShadow
-    strength: wp.array | None
-    """(H W,) float32, strength of the shadow at each pixel; None without shadow."""
+    strengths: list[wp.array] | None
+    """(H W,) float32 each, strength of every shadow of ``shadow`` at each pixel; None without shadow."""
     floor_depth: wp.array | None = None
     """(H W,) float32, z-depth of an opaque floor that hides what is below it, 0 where there is none; None if there is
     no such floor."""
@@ -50,18 +51,18 @@ class Backdrop:
     def shadow_opacity(self, body: GaussianCloud) -> wp.array:
         """Return (H, W) float32, 0 to about 0.5, the opacity of the shadow of ``body``."""
         camera = self.shadow.camera
-        if self.strength is None:
+        if self.strengths is None:
             return wp.zeros((camera.height, camera.width), dtype=wp.float32, device=self.shadow.device)
-        return self.shadow.cover(body, self.strength).reshape((camera.height, camera.width))
+        return self.shadow.cover(body, self.strengths).reshape((camera.height, camera.width))
 
     def background(self, body: GaussianCloud) -> wp.array:
         """Return (H, W) vec3, the background with the shadow of ``body``."""
         camera, device = self.shadow.camera, self.shadow.device
         shape = (camera.height, camera.width)
-        if self.strength is None:
+        if self.strengths is None:
             return self.unshadowed.reshape(shape)
         colour = empty(len(self.unshadowed), wp.vec3, device)
-        cover = self.shadow.cover(body, self.strength)
+        cover = self.shadow.cover(body, self.strengths)
         launch_rows(kernels.dim_kernel, len(colour), inputs=[self.unshadowed, cover], outputs=[colour], device=device)
         return colour.reshape(shape)
 
@@ -94,13 +95,13 @@ def studio_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> 
         outputs=[colour],
         device=ground.device,
     )
-    return Backdrop(colour, ground, ground.fade if shadow else None, ground.depth)
+    return Backdrop(colour, ground, ground.strengths() if shadow else None, ground.depth)
 
 
 def plain_colour(ground: ContactShadow, colour: tuple[float, float, float], *, shadow: bool = True) -> Backdrop:
     """Return a backdrop of one colour with only the shadow. Its ``shadow_opacity`` can be laid over another image."""
     colour_without_shadow = wp.full(len(ground.depth), wp.vec3(*colour), dtype=wp.vec3, device=ground.device)
-    return Backdrop(colour_without_shadow, ground, ground.fade if shadow else None, ground.depth)
+    return Backdrop(colour_without_shadow, ground, ground.strengths() if shadow else None, ground.depth)
 
 
 def captured_scene(
@@ -112,6 +113,7 @@ def captured_scene(
     reach: float,
     blur_radius: float,
     height: float,
+    light: MainLight | None = None,
     shadow: bool = True,
 ) -> Backdrop:
     """Render the rest of a capture once; the shadow falls where the visible surface is near the plane.
@@ -121,7 +123,7 @@ def captured_scene(
         camera: camera.
         plane: ground.
         centre, reach: (3,) and radius of the disc that can be in shadow, world units.
-        blur_radius, height: as for ``ContactShadow``.
+        blur_radius, height, light: as for ``ContactShadow``.
         shadow: False for no shadow.
     """
     import cv2
@@ -137,6 +139,7 @@ def captured_scene(
         blur_radius=blur_radius,
         height=height,
         depth=np.asarray(cv2.medianBlur(depth, 5)),
+        light=light,
     )
     colour_without_shadow = wp.array(
         np.clip(image.colour.numpy(), 0.0, 1.0).reshape(-1, 3), dtype=wp.vec3, device=scene.device
@@ -150,5 +153,4 @@ def captured_scene(
     kernel = 2 * (max(camera.width, camera.height) // 40) + 1
     on_plane = np.asarray(cv2.medianBlur(np.rint(255.0 * on_plane).astype(np.uint8), kernel), np.float32) / 255.0
     on_plane = cv2.GaussianBlur(on_plane, (0, 0), _EDGE_BLUR_FRACTION * kernel)
-    strength = on_plane * ground.fade.numpy().reshape(shape) * image.alpha.numpy()
-    return Backdrop(colour_without_shadow, ground, wp.array(strength.ravel(), dtype=wp.float32, device=scene.device))
+    return Backdrop(colour_without_shadow, ground, ground.strengths(on_plane * image.alpha.numpy()))

@@ -1,7 +1,8 @@
-"""Soft shadow that Gaussians cast straight down on a plane, as one camera sees it."""
+"""Shadows that Gaussians cast on a plane, straight down or by the main light, as one camera sees them."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import warp as wp
 
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.render import backdrop as kernels
 from egs_warp.launching import empty, launch_cached, launch_rows, zeros
@@ -16,6 +18,14 @@ from egs_warp.render.projection import view_from_camera
 
 _LAYERS = ((0.0, 0.1, 0.035), (0.1, 0.35, 0.08), (0.35, 2.0, 0.16))
 """Height range over the plane and blur width of each layer, relative to the body height."""
+_CAST_EDGES = (0.0, 0.2, 0.6, 6.0)
+"""Heights over the plane, relative to the body height, between the layers of the shadow of the main light."""
+_CAST_HEIGHTS = (0.1, 0.4, 1.0)
+"""Height of each of these layers from which the width of its penumbra is computed, relative to the body height."""
+_PENUMBRA = 0.5
+"""Standard deviation of a penumbra, relative to half its width: that of a uniform disc."""
+_MIN_SINE = 0.17
+"""Smallest sine of the light's elevation that is used: 10 degrees."""
 _MIN_BLUR = 0.6
 """Smallest standard deviation of a blur, texels."""
 _BLUR_REACH = 4.0
@@ -29,11 +39,105 @@ def shadow_blur_radius(body: GaussianCloud) -> float:
     return float(np.exp(np.median(np.median(body.log_scales.numpy(), axis=1))))
 
 
+class ShadowMap:
+    """Shadow of a body on the disc of a plane, from straight above or from the main light.
+
+    Straight down, the shadow of a Gaussian depends on its opacity and on the area of its broad side; shadows of higher
+    Gaussians are wider and paler. The shadow of the main light is displaced along the light, and is blurred by the
+    width of its penumbra only.
+    """
+
+    def __init__(
+        self,
+        plane: Plane,
+        *,
+        centre: np.ndarray,
+        reach: float,
+        device: wp.Device,
+        blur_radius: float = 0.0,
+        height: float = 0.0,
+        light: MainLight | None = None,
+    ) -> None:
+        """Create the map.
+
+        Args:
+            plane: ground.
+            centre, reach: (3,) and radius of the disc that can be in shadow, world units.
+            device: device of the arrays.
+            blur_radius: world units, blur radius of the body, see ``shadow_blur_radius``; 0 without a body.
+            height: height of the body, world units; 0 without a body.
+            light: main light, world axes; None casts straight down.
+        """
+        self.device = device
+        self.ground = _ground(plane, centre, reach, light)
+        self._layers = kernels.Layers()
+        texel = 2.0 * reach / _MAP
+        if light is None:
+            edges, blurs = np.array([layer[:2] for layer in _LAYERS]), np.array([layer[2] for layer in _LAYERS])
+            # Higher layers block less of the sky, so they darken less.
+            self._max_opacity = wp.vec3(*(0.5 - 1.5 * blur for _, _, blur in _LAYERS))
+        else:
+            edges = np.column_stack([_CAST_EDGES[:-1], _CAST_EDGES[1:]])
+            sine = max(float(light.direction @ plane.normal), _MIN_SINE)
+            blurs = _PENUMBRA * np.tan(np.radians(light.half_angle)) / sine * np.array(_CAST_HEIGHTS)
+            self._max_opacity = wp.vec3(1.0, 1.0, 1.0)
+        self._layers.low = wp.vec3(*(height * edges[:, 0]).tolist())
+        self._layers.high = wp.vec3(*(height * edges[:, 1]).tolist())
+        self._grain = _taps(np.full(len(_LAYERS), blur_radius) / texel, device)
+        self._blur = _taps(height * blurs / texel, device)
+
+    def of(self, body: GaussianCloud) -> wp.array:
+        """Return the shadow (texels, texels) float32 of ``body`` on the plane, seen from above; 1 is full shadow."""
+        shape = (len(_LAYERS), _MAP, _MAP)
+        coverage = zeros(shape, wp.int64, self.device)
+        # Use one thread on a CPU, where concurrent additions to one texel are not atomic.
+        launch_cached(
+            kernels.coverage_kernel,
+            body.count,
+            inputs=[self.ground, self._layers, body.means, body.log_scales, body.opacity_logits],
+            outputs=[coverage],
+            device=self.device,
+        )
+        layers, scratch = empty(shape, wp.float32, self.device), empty(shape, wp.float32, self.device)
+        count = int(np.prod(shape))
+        self._launch(kernels.unpack_coverage_kernel, count, [coverage], [layers])
+        self._blur_layers(layers, scratch, self._grain)
+        self._launch(kernels.opacity_kernel, count, [], [layers])
+        self._blur_layers(layers, scratch, self._blur)
+        shade = empty(shape[1:], wp.float32, self.device)
+        self._launch(kernels.combine_layers_kernel, _MAP * _MAP, [layers, self._max_opacity], [shade])
+        return shade
+
+    def texels(self, points: np.ndarray) -> np.ndarray:
+        """Return the map position (n, 2), texels from the corner, of the shadow on ``points`` (n, 3)."""
+        ground, away = self.ground, points - np.array(self.ground.centre)
+        axes = np.array([ground.first, ground.second, ground.normal])
+        flat = away @ axes.T
+        across = flat[:, :2] - (flat[:, 2] + ground.rise)[:, None] * np.array(ground.slope)
+        return 0.5 * _MAP * (across / ground.reach + 1.0)
+
+    def cover(self, shade: wp.array, texels: wp.array, strength: wp.array) -> wp.array:
+        """Return (n,) float32, the shadow map ``shade`` at ``texels`` (n,) vec2, times ``strength`` (n,)."""
+        cover = empty(len(strength), wp.float32, self.device)
+        self._launch(kernels.shadow_opacity_kernel, len(strength), [shade, texels, strength], [cover])
+        return cover
+
+    def _blur_layers(self, layers: wp.array, scratch: wp.array, taps: list[wp.array]) -> None:
+        """Blur ``layers`` in place by the ``taps`` of each."""
+        occupied = empty(len(_LAYERS) * _MAP, wp.bool, self.device)
+        for source, target in ((layers, scratch), (scratch, layers)):
+            self._launch(kernels.occupied_rows_kernel, len(occupied), [source], [occupied])
+            self._launch(kernels.blur_kernel, source.size, [source, occupied, *taps], [target])
+
+    def _launch(self, kernel: Any, count: int, inputs: list[Any], outputs: list[wp.array]) -> None:
+        launch_rows(kernel, count, inputs=inputs, outputs=outputs, device=self.device)
+
+
 class ContactShadow:
     """The ground as one camera sees it, and the shadow of a body on it.
 
-    The shadow of a Gaussian depends on its opacity and on the area of its broad side; shadows of higher Gaussians are
-    wider and paler. Arrays are on ``device``, in row-major order of the pixels.
+    Without a main light the shadow is cast straight down. With one, this shadow is paler, and that of the light is
+    added. Arrays are on ``device``, in row-major order of the pixels.
     """
 
     def __init__(
@@ -47,6 +151,7 @@ class ContactShadow:
         blur_radius: float = 0.0,
         height: float = 0.0,
         depth: np.ndarray | None = None,
+        light: MainLight | None = None,
     ) -> None:
         """Compute the ground point of every pixel.
 
@@ -58,14 +163,9 @@ class ContactShadow:
             blur_radius: world units, blur radius of the body, see ``shadow_blur_radius``; 0 without a body.
             height: height of the body, world units; 0 without a body.
             depth: (H, W) z-depth of the uneven ground that receives the shadow, 0 where the plane receives it.
+            light: main light, world axes; None without one.
         """
         self.camera, self.plane, self.device = camera, plane, device
-        edges = height * np.array([layer[:2] for layer in _LAYERS])
-        self._layers = kernels.Layers()
-        self._layers.low, self._layers.high = wp.vec3(*edges[:, 0].tolist()), wp.vec3(*edges[:, 1].tolist())
-        texel, blurs = 2.0 * reach / _MAP, np.array([layer[2] for layer in _LAYERS])
-        self._grain = _taps(np.full(len(_LAYERS), blur_radius) / texel, device)
-        self._blur = _taps(height * blurs / texel, device)
         count = camera.width * camera.height
         self.depth = empty(count, wp.float32, device)
         """(H W,) z-depth of the plane, 0 where a pixel's ray does not meet it from above."""
@@ -77,56 +177,74 @@ class ContactShadow:
         """(H W,) size of a pixel on the plane, world units."""
         self.surface_height = empty(count, wp.float32, device)
         """(H W,) height of the ground over the plane, world units."""
-        self._texels = empty(count, wp.vec2, device)
-        self._ground = _ground(plane, centre, reach)
         uneven = np.zeros(count) if depth is None else depth.ravel()
-        surface_depth = wp.array(uneven, dtype=wp.float32, device=device)
-        self._launch(
+        self._surface_depth = wp.array(uneven, dtype=wp.float32, device=device)
+        body = {"device": device, "blur_radius": blur_radius, "height": height}
+        maps = [ShadowMap(plane, centre=centre, reach=reach, **body)]
+        opacities = [1.0]
+        if light is not None and light.shade > 0.0:
+            # Seen from the disc's centre the light's map is displaced by half a shadow, and larger by as much.
+            half = 0.5 * height * _slope(plane, light)
+            moved = centre - np.stack(plane.tangents(), axis=1) @ half
+            maps.append(ShadowMap(plane, centre=moved, reach=reach + float(np.linalg.norm(half)), light=light, **body))
+            opacities = [1.0 - light.shade, light.shade]
+        outputs = [self.depth, self.flat, self.fade, self.pixel, self.surface_height]
+        self._receivers = []
+        for one, opacity in zip(maps, opacities, strict=True):
+            texels = self._on_ground(one, outputs)
+            self._receivers.append(_Receiver(one, texels, outputs[2], opacity))
+            outputs = [empty(len(output), output.dtype, device) for output in outputs]
+
+    def strengths(self, surface: np.ndarray | None = None) -> list[wp.array]:
+        """Return the strength (H W,) float32 of each shadow; ``surface`` (H, W) is the fraction of a pixel that
+        receives shadow, None if that is the plane."""
+        received = np.ones(len(self.depth), np.float32) if surface is None else surface.ravel().astype(np.float32)
+        return [
+            wp.array(np.float32(one.opacity) * received * one.fade.numpy(), dtype=wp.float32, device=self.device)
+            for one in self._receivers
+        ]
+
+    def cover(self, body: GaussianCloud, strengths: list[wp.array]) -> wp.array:
+        """Return (H W,) float32, the opacity of the shadow of ``body`` with the ``strengths`` of each shadow."""
+        covers = [
+            one.shadow_map.cover(one.shadow_map.of(body), one.texels, strength)
+            for one, strength in zip(self._receivers, strengths, strict=True)
+        ]
+        for other in covers[1:]:
+            launch_rows(kernels.join_covers_kernel, len(other), inputs=[other], outputs=[covers[0]], device=self.device)
+        return covers[0]
+
+    def _on_ground(self, shadow_map: ShadowMap, outputs: list[wp.array]) -> wp.array:
+        """Compute the ground of every pixel into ``outputs``; return its position (H W,) vec2 in the map."""
+        camera, count = self.camera, len(self.depth)
+        texels = empty(count, wp.vec2, self.device)
+        ground = shadow_map.ground
+        launch_rows(
             kernels.ground_kernel,
             count,
-            [view_from_camera(camera), self._ground, wp.vec3(*(camera.centre - centre).tolist()), surface_depth],
-            [self.depth, self.flat, self.fade, self.pixel, self.surface_height, self._texels],
-        )
-
-    def cover(self, body: GaussianCloud, strength: wp.array) -> wp.array:
-        """Return (H W,) float32, the opacity of the shadow of ``body``: 0 to about 0.5, times ``strength`` (H W,)."""
-        cover = empty(len(strength), wp.float32, self.device)
-        self._launch(kernels.shadow_opacity_kernel, len(strength), [self._shade(body), self._texels, strength], [cover])
-        return cover
-
-    def _shade(self, body: GaussianCloud) -> wp.array:
-        """Return the shadow map (texels, texels) float32, seen from above."""
-        shape = (len(_LAYERS), _MAP, _MAP)
-        coverage = zeros(shape, wp.int64, self.device)
-        # Use one thread on a CPU, where concurrent additions to one texel are not atomic.
-        launch_cached(
-            kernels.coverage_kernel,
-            body.count,
-            inputs=[self._ground, self._layers, body.means, body.log_scales, body.opacity_logits],
-            outputs=[coverage],
+            inputs=[
+                view_from_camera(camera),
+                ground,
+                wp.vec3(*(camera.centre - np.array(ground.centre)).tolist()),
+                self._surface_depth,
+            ],
+            outputs=[*outputs, texels],
             device=self.device,
         )
-        layers, scratch = empty(shape, wp.float32, self.device), empty(shape, wp.float32, self.device)
-        count = int(np.prod(shape))
-        self._launch(kernels.unpack_coverage_kernel, count, [coverage], [layers])
-        self._blur_layers(layers, scratch, self._grain)
-        self._launch(kernels.opacity_kernel, count, [], [layers])
-        self._blur_layers(layers, scratch, self._blur)
-        shade = empty(shape[1:], wp.float32, self.device)
-        # Higher layers block less of the sky, so they darken less.
-        max_opacity = wp.vec3(*(0.5 - 1.5 * blur for _, _, blur in _LAYERS))
-        self._launch(kernels.combine_layers_kernel, _MAP * _MAP, [layers, max_opacity], [shade])
-        return shade
+        return texels
 
-    def _blur_layers(self, layers: wp.array, scratch: wp.array, taps: list[wp.array]) -> None:
-        """Blur ``layers`` in place by the ``taps`` of each."""
-        occupied = empty(len(_LAYERS) * _MAP, wp.bool, self.device)
-        for source, target in ((layers, scratch), (scratch, layers)):
-            self._launch(kernels.occupied_rows_kernel, len(occupied), [source], [occupied])
-            self._launch(kernels.blur_kernel, source.size, [source, occupied, *taps], [target])
 
-    def _launch(self, kernel: Any, count: int, inputs: list[Any], outputs: list[wp.array]) -> None:
-        launch_rows(kernel, count, inputs=inputs, outputs=outputs, device=self.device)
+@dataclass(frozen=True)
+class _Receiver:
+    """Pixels that receive the shadow of one map."""
+
+    shadow_map: ShadowMap
+    texels: wp.array
+    """(H W,) vec2, position in the map."""
+    fade: wp.array
+    """(H W,) float32, 1 around the centre of the map, 0 at its edge."""
+    opacity: float
+    """Opacity of full shadow."""
 
 
 def _taps(widths: np.ndarray, device: wp.Device) -> list[wp.array]:
@@ -140,10 +258,19 @@ def _taps(widths: np.ndarray, device: wp.Device) -> list[wp.array]:
     return [wp.array(taps, wp.float32, device=device), wp.array(reach, wp.int32, device=device)]
 
 
-def _ground(plane: Plane, centre: np.ndarray, reach: float) -> Any:
+def _slope(plane: Plane, light: MainLight | None) -> np.ndarray:
+    """Return the displacement (2,) along the plane's tangents, towards the light, per height over the plane."""
+    if light is None:
+        return np.zeros(2)
+    sine = max(float(light.direction @ plane.normal), _MIN_SINE)
+    return np.array(plane.tangents()) @ light.direction / sine
+
+
+def _ground(plane: Plane, centre: np.ndarray, reach: float, light: MainLight | None) -> Any:
     ground = kernels.Ground()
     first, second = plane.tangents()
     ground.normal, ground.first, ground.second = (wp.vec3(*axis.tolist()) for axis in (plane.normal, first, second))
     ground.centre = wp.vec3(*np.asarray(centre, float).tolist())
+    ground.slope = wp.vec2(*_slope(plane, light).tolist())
     ground.rise, ground.reach = float(plane.heights(centre)), reach
     return ground

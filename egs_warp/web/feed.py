@@ -11,8 +11,11 @@ import numpy as np
 
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
+from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.main_light import MainLight
+from egs_warp.lighting.remaining_shadow import without_shadow
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.motions.style import MAX_FACTOR, MIN_FACTOR, PRESETS, Style
 from egs_warp.pipelines.creature import Creature, initial_stance
@@ -33,6 +36,10 @@ class LiveFeed:
     def __init__(self, session: Session, *, scene: GaussianCloud | None = None) -> None:
         """Create the feed of ``session``; ``scene`` is the background in the frame of the body, or None."""
         self.session = session
+        light = session.drawn_as.light
+        if scene is not None and light is not None:
+            creature = session.creature
+            scene = without_shadow(scene, creature.cloud, creature.geometry.field or GROUND, light)
         self._scene = scene
         self._name = secrets.token_hex(8)
         self._header: bytes | None = None
@@ -107,6 +114,9 @@ def live_camera(creature: Creature, *, size: int = 512) -> Camera:
     )
 
 
-def live_render_data(creature: Creature, splats: GaussianCloud) -> RenderData:
-    """Return the data with which the page draws ``creature``; ``splats`` are its Gaussians, split at rest."""
-    return RenderData.of(splats, live_camera(creature), creature.muscles, initial_stance(creature).feet())
+def live_render_data(creature: Creature, splats: GaussianCloud, *, light: MainLight | None = None) -> RenderData:
+    """Return the data with which the page draws ``creature``; ``splats`` are its Gaussians, split at rest, and
+    ``light`` is the main light in the axes of the capture."""
+    placed = None if light is None else light.rotated(creature.frame.axes)
+    feet = initial_stance(creature).feet()
+    return RenderData.of(splats, live_camera(creature), creature.muscles, feet, light=placed)

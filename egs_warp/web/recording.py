@@ -10,7 +10,9 @@ import numpy as np
 
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.geometry.main_light import mean_irradiance
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.lighting.surface_normals import surface_normals
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.finished_run import FinishedRun
@@ -49,7 +51,7 @@ class Recording(FinishedRun):
             "notes": report.get("notes", []),
         }
         plan = {"plan": t.planned_com[self.steps].astype(np.float32)} if len(t.planned_com) else {}
-        constants = (self.creature, self.mesh, t.node_mass, t.planes, self.deformer(), self.scene)
+        constants = (self.creature, self.mesh, t.node_mass, t.planes, self.deformer(), self.scene_without_shadow())
         return creature_header(facts, *constants, more=plan)
 
     def frames(self) -> Iterator[Frame]:
@@ -96,7 +98,7 @@ def creature_header(
         node_mass: (N,) kg, mass of each node.
         planes: (P, 4) rows n, d of the ground planes.
         deformer: embedding of the Gaussians in the cage.
-        scene: background, or None.
+        scene: background, without the shadow of the object if there is a main light; or None.
         more: further arrays by name.
     """
     camera = render_data.camera
@@ -134,6 +136,14 @@ def creature_header(
     }
     if scene is not None:
         arrays |= splat_arrays("scene", scene)
+    light = render_data.light
+    if light is not None:
+        facts["light"] = {
+            "direction": light.direction.tolist(),
+            "shade": light.shade,
+            "irradiance": (light.irradiance / mean_irradiance(light)).ravel().tolist(),
+        }
+        arrays["splats_normals"] = np.rint(128.0 + 127.0 * surface_normals(render_data.splats)).astype(np.uint8)
     return header(facts, arrays)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.planes import HoleOutline, PlaneRecord, read_planes, write_planes
 from tests.support.waves import wavy_ground
@@ -16,10 +17,13 @@ from tests.support.waves import wavy_ground
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), -0.25)
 GROUND = wavy_ground(spacing=0.5)
 HOLE = HoleOutline(np.array([1.0, 2.0, 0.25]), 0.5, (8, 6), (np.array([[1, 1], [4, 1], [4, 5]]),))
+LIGHT = MainLight(np.array([0.0, 0.6, 0.8]), 5.0, 0.2, np.eye(4))
 
 
 def test_known_values_are_read_back(tmp_path: Path) -> None:
-    known = PlaneRecord(FLOOR, np.array([1.0, 2.0, 3.0]), 0.7, 0.01, 0.9, 120, 0.3, HOLE, GROUND, {"remark": ["a", 1]})
+    known = PlaneRecord(
+        FLOOR, np.array([1.0, 2.0, 3.0]), 0.7, 0.01, 0.9, 120, 0.3, HOLE, GROUND, {"remark": ["a", 1]}, LIGHT
+    )
     write_planes(tmp_path / "plane.json", [known, PlaneRecord(FLOOR)])
     full, bare = read_planes(tmp_path / "plane.json")
     assert full.to_json() == known.to_json() and full.pixels == 120 and full.others == {"remark": ["a", 1]}
@@ -27,6 +31,7 @@ def test_known_values_are_read_back(tmp_path: Path) -> None:
     assert full.ground is not None and full.ground.ground_height(np.zeros(3)) == pytest.approx(
         GROUND.ground_height(np.zeros(3)), abs=1e-4
     )
+    assert full.light is not None and np.array_equal(full.light.irradiance, LIGHT.irradiance)
     assert bare.to_json() == {"normal": [0.0, 0.0, 1.0], "offset": -0.25}
 
 
@@ -41,6 +46,11 @@ def test_new_values_replace_the_known_ones() -> None:
     [
         ({"hole": {"texels": [8, 6]}}, "its hole is not valid; write the file again with egs-warp segment"),
         ({"hole": 3}, "its hole is not valid; write the file again with egs-warp segment"),
+        ({"light": {"direction": [0, 0, 1]}}, "its light is damaged; make it again with egs-warp segment"),
+        (
+            {"light": {"direction": [0, 0, 2], "half_angle": 5, "shade": 0.2, "irradiance": np.eye(4).tolist()}},
+            "its light is damaged; make it again with egs-warp segment",
+        ),
         ({"ground": {"spacing": 1.0}}, "its ground is damaged; make it again with egs-warp segment"),
         ({"ground": [1, 2]}, "its ground is damaged; make it again with egs-warp segment"),
         (

@@ -9,16 +9,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from egs_warp.assets import pawn
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.main_light import MainLight, irradiance_form
 from egs_warp.io import write_ply
 from egs_warp.io.run_folder import run_folder as owned
 from egs_warp.io.video import VideoWriter
 from egs_warp.pipelines.film import drawn_frames
 from egs_warp.pipelines.finished_run import FinishedRun
+from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.render_run import Show, render_run
 from egs_warp.pipelines.shot import Shot, around, framed, nearest_steps, resized
 
@@ -198,6 +201,35 @@ def test_videos_keep_alpha(ending: str, run: FinishedRun, tmp_path: Path) -> Non
         assert np.abs(read[..., 3] - made[..., 3]).mean() < 2.0
         inside = made[..., 3] > 250
         assert np.abs(read[inside, :3] - made[inside, :3]).mean() < 8.0
+
+
+def test_a_main_light_changes_the_shadow_and_no_pixel_of_a_creature_at_rest(run: FinishedRun, tmp_path: Path) -> None:
+    """The light is read back from the run's file. The creature's colours have the same bits until it turns, and
+    without the light the picture is that of a run that has none."""
+    direction = np.array([0.48, 0.64, 0.6])
+    form = irradiance_form(0.4, 0.1, np.array([0.0, 0.0, 1.0]), 0.8, direction)
+    creature = replace(run.creature, light=MainLight(direction, 5.0, 0.4, form))
+    creature.save(tmp_path / "creature.npz")
+    lit = replace(run, creature=RenderData.load(tmp_path / "creature.npz", node_count=len(run.mesh.nodes)))
+    shot, step = Shot(size=(96, 96), transparent=True), np.zeros(1, int)
+    camera = [resized(run.creature.camera, 96, 96)]
+    light = lit.creature.light
+    assert light is not None
+    (plain,), (shone,) = (
+        [*drawn_frames(run.deformer(), run.trajectory, step, camera, shot, light=one)] for one in (None, light)
+    )
+    assert plain.shade is not None and shone.shade is not None
+    np.testing.assert_array_equal(shone.image.colour.numpy(), plain.image.colour.numpy())
+    assert np.abs(shone.shade.numpy() - plain.shade.numpy()).max() > 0.1
+    turned = run.trajectory.positions[:1] @ Rotation.from_euler("z", 120.0, degrees=True).as_matrix().T
+    path = replace(run.trajectory, positions=turned)
+    (captured,), (relit,) = (
+        [*drawn_frames(run.deformer(), path, step, camera, shot, light=one)] for one in (None, light)
+    )
+    assert np.abs(captured.image.colour.numpy() - relit.image.colour.numpy()).max() > 0.05
+    for place, one, use in (("plain", run, True), ("off", lit, False)):
+        render_run(one, tmp_path / place, Shot(size=(32, 32), fps=2.0), light=use, quiet=True)
+    assert (tmp_path / "plain" / "frame0000.png").read_bytes() == (tmp_path / "off" / "frame0000.png").read_bytes()
 
 
 def test_a_turntable_shows_one_frame(run: FinishedRun, tmp_path: Path) -> None:

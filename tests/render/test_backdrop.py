@@ -142,7 +142,7 @@ def test_the_shadow_equals_the_reference(tilt: float, device: str) -> None:
     )
     centre = np.array([0.1, -0.2, 0.0])
     ground = on_ground(body, plane, centre, height=0.7)
-    found = ground.cover(body, ground.fade)
+    found = ground.cover(body, ground.strengths())
     expected = darkness(body, plane, centre, 2.0, 0.7)
     assert expected.max() > 0.3
     np.testing.assert_allclose(square(found), expected, atol=0.01)

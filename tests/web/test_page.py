@@ -20,9 +20,11 @@ from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.main_light import MainLight, irradiance_form
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io import write_ply
+from egs_warp.lighting.relighting import Relighter
 from egs_warp.render.backdrop import studio_floor
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.render.shadow import ContactShadow
@@ -114,6 +116,46 @@ def test_a_capture_trained_with_antialiasing_is_drawn_so(chromium: Any, recordin
     picture = _picture(page)
     likeness = _psnr_on_body(_own_picture(smooth, page, 0), picture)
     assert likeness >= max(40.0, 5.0 + _psnr_on_body(_own_picture(recording, page, 0), picture))
+    assert complaints == []
+    page.close()
+
+
+def test_the_page_relights_the_body_and_casts_the_shadow_of_the_main_light(
+    chromium: Any, recording: Recording, tmp_path: Path
+):
+    """A turned body has the colours of the film, and the floor is darker behind the body as seen from the light."""
+    direction = np.array([0.48, 0.64, 0.6])
+    light = MainLight(direction, 5.0, 0.5, irradiance_form(0.3, 0.0, np.array([0.0, 0.0, 1.0]), 1.0, direction))
+    t = recording.trajectory
+    turned = t.positions @ Rotation.from_euler("z", 150.0, degrees=True).as_matrix().T
+    lit = replace(
+        recording,
+        trajectory=replace(t, positions=turned),
+        creature=replace(recording.creature, light=light),
+    )
+    export_page(tmp_path / "page.html", [lit])
+    page, complaints = opened(chromium, (tmp_path / "page.html").as_uri())
+    page.evaluate("egs.setLayer('ground', false); egs.viewers[0].preset('front')")
+    splats = recording.creature.splats
+    deformed = Deformer(splats, embed_gaussians(splats, TetMesh(t.rest_positions, t.tets))).deform(turned[0])
+    relit = Relighter(splats, light).relight(deformed.cloud, deformed.rotations)
+    ours, captured = (
+        np.clip(render_gaussians(cloud, _camera(page), background=_BACKGROUND).colour.numpy(), 0.0, 1.0)
+        for cloud in (relit, deformed.cloud)
+    )
+    picture = _picture(page)
+    assert _psnr_on_body(ours, picture) >= 38.0 > 10.0 + _psnr_on_body(captured, picture)
+    page.evaluate("egs.setLayer('ground', true); egs.setLayer('splats', false); egs.viewers[0].preset('top')")
+    camera, floor = _camera(page), _picture(page).mean(axis=-1)
+    centre = np.einsum("n,ni->i", t.node_mass, turned[0]) / t.node_mass.sum()
+    foot = centre - centre[2] / direction[2] * direction
+    levels = []
+    for point in (foot, 2.0 * centre * [1.0, 1.0, 0.0] - foot):
+        x, y, z = camera.rotation @ (point - camera.centre)
+        column, row = round(camera.cx + camera.fx * x / z), round(camera.cy + camera.fy * y / z)
+        levels.append(floor[row - 3 : row + 4, column - 3 : column + 4].mean())
+    shadow, opposite = levels
+    assert shadow < 0.75 * opposite
     assert complaints == []
     page.close()
 

@@ -36,6 +36,8 @@ class Ground:
     """Height of the centre over the plane."""
     reach: wp.float32
     """Radius of the disc."""
+    slope: wp.vec2
+    """Displacement along the axes of the plane, towards the light, per height over it; zero casts straight down."""
 
 
 @wp.struct
@@ -50,10 +52,12 @@ class Layers:
 
 @wp.func
 def texel_of(ground: Ground, away: wp.vec3) -> wp.vec2:
-    """Return the map position, in texels from the corner, straight below a point at the offset ``away`` from the
-    centre."""
+    """Return the map position, in texels from the corner, behind a point at the offset ``away`` from the centre, seen
+    from the light."""
     side = 0.5 * wp.float32(TEXELS)
-    across = wp.vec2(wp.dot(away, ground.first), wp.dot(away, ground.second)) / ground.reach
+    height = wp.dot(away, ground.normal) + ground.rise
+    flat = wp.vec2(wp.dot(away, ground.first), wp.dot(away, ground.second))
+    across = (flat - height * ground.slope) / ground.reach
     return wp.vec2((across[0] + 1.0) * side, (across[1] + 1.0) * side)
 
 
@@ -85,7 +89,7 @@ def ground_kernel(
         fade_out: 1 at the centre, 0 from ``reach`` on.
         pixel_out: size of a pixel on the plane.
         lift_out: height of the visible surface over the plane.
-        texel_out: map position below the visible surface.
+        texel_out: map position behind the visible surface.
     """
     tid = wp.tid() + first_row
     u = wp.float32(tid % view.width) + 0.5
@@ -330,6 +334,19 @@ def shadow_opacity_kernel(
         lower = wp.lerp(shade_at(shade, row + 1, column), shade_at(shade, row + 1, column + 1), right)
         cover = strength[tid] * wp.lerp(upper, lower, below)
     shadow_opacity_out[tid] = cover
+
+
+@wp.kernel
+def join_covers_kernel(
+    first_row: wp.int32,
+    # In:
+    other: wp.array[wp.float32],
+    # In and out:
+    cover: wp.array[wp.float32],
+):
+    """Combine two shadows, each of which lets a part of the light pass."""
+    tid = wp.tid() + first_row
+    cover[tid] = 1.0 - (1.0 - cover[tid]) * (1.0 - other[tid])
 
 
 @wp.kernel

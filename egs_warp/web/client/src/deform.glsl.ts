@@ -78,10 +78,20 @@ float egsLight(sampler2D shade, vec4 region, vec3 p) {
   return mix(1.0, egsShade(shade, uv, 0.02), near);
 }
 
+/* Gain of the displayed colour of a splat whose normal n has turned, as in egs_warp/kernels/lighting/relighting.py. */
+float egsGain(mat4 form, vec3 n, mat3 turn) {
+  float angle = acos(clamp(0.5 * (turn[0][0] + turn[1][1] + turn[2][2] - 1.0), -1.0, 1.0));
+  float share = clamp((angle - 0.0175) / (0.07 - 0.0175), 0.0, 1.0);
+  if (share == 0.0 || dot(n, n) < 0.25) return 1.0;
+  vec4 before = vec4(normalize(n), 1.0), after = vec4(turn * before.xyz, 1.0);
+  float ratio = max(dot(after, form * after), 0.2) / max(dot(before, form * before), 0.2);
+  return mix(1.0, pow(clamp(ratio, 0.4, 2.5), 1.0 / 2.2), share);
+}
+
 /* The eye is in the axes of the splats; place is their transform to the world. */
 CovSplat egsDeformed(
     int index, sampler2D splats, sampler2D arms, sampler2D bands, mat4 scales, sampler2D cage, sampler2D shade,
-    vec4 shadeRegion, vec3 eye, mat4 place, int degree, float maxStretch) {
+    vec4 shadeRegion, vec3 eye, mat4 place, sampler2D normals, mat4 irradiance, int degree, float maxStretch) {
   vec4 a = egsTexel(splats, 4 * index), q = egsTexel(splats, 4 * index + 1);
   vec4 s = egsTexel(splats, 4 * index + 2), colour = egsTexel(splats, 4 * index + 3);
   vec3 mean = a.xyz;
@@ -121,6 +131,10 @@ CovSplat egsDeformed(
   result.flags = GSPLAT_FLAG_ACTIVE;
   result.index = index;
   result.rgba = vec4(max(colour.rgb + egsColour(bands, scales, index, degree, direction), 0.0), s.w);
+  if (irradiance[3][3] > 0.0) {
+    vec3 n = (egsTexel(normals, index).rgb * 255.0 - 128.0) / 127.0;
+    result.rgba.rgb *= egsGain(irradiance, n, egsPolar(stretched) * transpose(axes));
+  }
   if (shadeRegion.z > 0.0) result.rgba.rgb *= egsLight(shade, shadeRegion, moved);
   covariance = mat3(place) * covariance * transpose(mat3(place));
   result.xxyyzz = max(vec3(covariance[0][0], covariance[1][1], covariance[2][2]), 1e-16);

@@ -1,6 +1,7 @@
 // Floor with a grid that turns into a sky without an edge, as in the film, and the creature's soft shadow.
 
 import * as THREE from "three";
+import type { MainLight } from "./packets";
 // Explained in egs_warp/render/backdrop.py.
 import studio from "../../../render/studio.json";
 import { SHADOW_GLSL, WIDE_RADIUS } from "./shadow.glsl";
@@ -12,6 +13,21 @@ export const FLOOR_DEPTH = 0.015;
 const SHADOW_SIDE = 256;
 /** Radius of the contact shadow, as a fraction of the side of the shadow map. */
 const SOFTNESS = 0.014;
+/** Smallest sine of the elevation of the main light that is used, as in egs_warp/render/shadow.py. */
+const MIN_SINE = 0.17;
+/** Part of the body height by which the shadow map is displaced along the shadow of the main light. */
+const CAST_SHIFT = 0.4;
+/** Largest displacement of the map, in body heights: the body stays on it. */
+const MAX_SHIFT = 0.8;
+/** Blending that keeps the largest value of each channel. */
+const BRIGHTEST = {
+  side: THREE.DoubleSide,
+  depthTest: false,
+  blending: THREE.CustomBlending,
+  blendEquation: THREE.MaxEquation,
+  blendSrc: THREE.OneFactor,
+  blendDst: THREE.OneFactor,
+} as const;
 /** GLSL literals of the floor's look. */
 const LOOK = {
   floor: vec3(studio.floor),
@@ -34,14 +50,21 @@ export class Ground {
   private readonly caster: THREE.Mesh;
   private readonly casters = new THREE.Scene();
   private readonly points: THREE.BufferAttribute;
+  /** Displacement of the shadow of the main light, per height over the ground. */
+  private readonly slope = new THREE.Vector2();
 
-  constructor(surface: Int32Array, nodeCount: number, height: number) {
+  constructor(surface: Int32Array, nodeCount: number, height: number, light?: MainLight) {
     this.target = new THREE.WebGLRenderTarget(SHADOW_SIDE, SHADOW_SIDE, {
       depthBuffer: false,
       generateMipmaps: true,
       minFilter: THREE.LinearMipmapLinearFilter,
     });
     const half = 1.5 * height;
+    const shade = light?.shade ?? 0;
+    if (light !== undefined && shade > 0) {
+      const [x, y, z] = light.direction;
+      this.slope.set(x, y).divideScalar(Math.max(z, MIN_SINE));
+    }
     this.shadow = { texture: this.target.texture, region: new THREE.Vector4(0, 0, half, height) };
     this.camera = new THREE.OrthographicCamera(-half, half, half, -half, -100 * height, 100 * height);
     const geometry = new THREE.BufferGeometry();
@@ -51,23 +74,42 @@ export class Ground {
     this.caster = new THREE.Mesh(
       geometry,
       new THREE.ShaderMaterial({
-        uniforms: { height: { value: height } },
+        uniforms: { height: { value: height }, ambient: { value: 1 - shade } },
         vertexShader: `varying float z;
           void main() { z = position.z; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
-        fragmentShader: `uniform float height; varying float z;
+        fragmentShader: `uniform float height, ambient; varying float z;
           void main() {
-            float h = max(z, 0.0) / height; gl_FragColor = vec4(1.0 / (1.0 + 3.0 * h), exp(-h / 0.05), 0.0, 1.0);
+            float h = max(z, 0.0) / height;
+            gl_FragColor = vec4(ambient / (1.0 + 3.0 * h), ambient * exp(-h / 0.05), 0.0, 1.0);
           }`,
-        side: THREE.DoubleSide,
-        depthTest: false,
-        blending: THREE.CustomBlending,
-        blendEquation: THREE.MaxEquation,
-        blendSrc: THREE.OneFactor,
-        blendDst: THREE.OneFactor,
+        ...BRIGHTEST,
       }),
     );
     this.caster.frustumCulled = false;
     this.casters.add(this.caster);
+    if (shade > 0) {
+      const cast = new THREE.Mesh(
+        geometry,
+        new THREE.ShaderMaterial({
+          uniforms: { slope: { value: this.slope }, shade: { value: shade } },
+          vertexShader: `uniform vec2 slope; varying vec2 at;
+            void main() {
+              vec3 p = vec3(position.xy - slope * max(position.z, 0.0), 0.0);
+              gl_Position = projectionMatrix * modelViewMatrix * vec4(p, 1.0);
+              at = gl_Position.xy;
+            }`,
+          // The shadow of a high jump ends softly at the edge of the map.
+          fragmentShader: `uniform float shade; varying vec2 at;
+            void main() {
+              float edge = smoothstep(1.0, 0.8, max(abs(at.x), abs(at.y)));
+              gl_FragColor = vec4(0.0, 0.0, shade * edge, 1.0);
+            }`,
+          ...BRIGHTEST,
+        }),
+      );
+      cast.frustumCulled = false;
+      this.casters.add(cast);
+    }
     const material = new THREE.ShaderMaterial({
       uniforms: {
         shade: { value: this.target.texture },
@@ -135,11 +177,14 @@ export class Ground {
     (this.points.array as Float32Array).set(positions);
     this.points.needsUpdate = true;
     const { uniforms } = this.mesh.material;
-    (uniforms.shadeCentre!.value as THREE.Vector2).set(centreOfMass.x, centreOfMass.y);
-    this.updateShadowBox(positions, centreOfMass);
-    this.camera.position.set(centreOfMass.x, centreOfMass.y, 0);
-    this.shadow.region.x = centreOfMass.x;
-    this.shadow.region.y = centreOfMass.y;
+    const height = this.shadow.region.w;
+    const shift = this.slope.clone().multiplyScalar(CAST_SHIFT).clampLength(0, MAX_SHIFT).multiplyScalar(height);
+    const centre = new THREE.Vector2(centreOfMass.x, centreOfMass.y).sub(shift);
+    (uniforms.shadeCentre!.value as THREE.Vector2).copy(centre);
+    this.updateShadowBox(positions, centre);
+    this.camera.position.set(centre.x, centre.y, 0);
+    this.shadow.region.x = centre.x;
+    this.shadow.region.y = centre.y;
     const saved = {
       target: renderer.getRenderTarget(),
       colour: renderer.getClearColor(new THREE.Color()),
@@ -154,23 +199,25 @@ export class Ground {
   }
 
   /** Set the bounding box of the shadow; the shader samples the shadow map only inside it. */
-  private updateShadowBox(positions: Float32Array, centreOfMass: THREE.Vector3): void {
+  private updateShadowBox(positions: Float32Array, centre: THREE.Vector2): void {
     let [left, right, near, far] = [Infinity, -Infinity, Infinity, -Infinity];
     for (let k = 0; k < positions.length; k += 3) {
-      left = Math.min(left, positions[k]!);
-      right = Math.max(right, positions[k]!);
-      near = Math.min(near, positions[k + 1]!);
-      far = Math.max(far, positions[k + 1]!);
+      const rise = Math.max(positions[k + 2]!, 0);
+      const [x, y] = [this.slope.x * rise, this.slope.y * rise];
+      left = Math.min(left, positions[k]! - Math.max(x, 0));
+      right = Math.max(right, positions[k]! - Math.min(x, 0));
+      near = Math.min(near, positions[k + 1]! - Math.max(y, 0));
+      far = Math.max(far, positions[k + 1]! - Math.min(y, 0));
     }
     const half = this.shadow.region.z;
-    const at = (x: number, centre: number): number => 0.5 + (0.5 * (x - centre)) / half;
+    const at = (x: number, middle: number): number => 0.5 + (0.5 * (x - middle)) / half;
     // The blur radius and a texel of the coarser level, clipped to the shadow map.
     const edge = WIDE_RADIUS + 10 / SHADOW_SIDE;
     (this.mesh.material.uniforms.box!.value as THREE.Vector4).set(
-      Math.max(at(left, centreOfMass.x) - edge, 0),
-      Math.max(at(near, centreOfMass.y) - edge, 0),
-      Math.min(at(right, centreOfMass.x) + edge, 1),
-      Math.min(at(far, centreOfMass.y) + edge, 1),
+      Math.max(at(left, centre.x) - edge, 0),
+      Math.max(at(near, centre.y) - edge, 0),
+      Math.min(at(right, centre.x) + edge, 1),
+      Math.min(at(far, centre.y) + edge, 1),
     );
   }
 }

@@ -30,6 +30,9 @@ export interface Facts {
   max_stretch: number;
   /** True if the capture was trained with antialiasing. */
   antialiased: boolean;
+  /** Main light of the capture: direction to it, fraction of the ground's brightness that its shadow removes, and the
+   * quadratic form of the irradiance, sixteen numbers. */
+  light?: MainLight;
   /** True for the still capture that is shown while its creature is prepared. */
   preparing?: boolean;
   /** True for a capture whose objects are picked. */
@@ -39,6 +42,12 @@ export interface Facts {
   limits?: { friction: [number, number]; sag: [number, number]; style: [number, number] };
   /** Named styles. */
   styles?: Record<string, Style>;
+}
+
+export interface MainLight {
+  direction: [number, number, number];
+  shade: number;
+  irradiance: number[];
 }
 
 /** Style of a jump; each value is a factor on the default (egs_warp/motions/style.py). */
@@ -174,7 +183,7 @@ export function indicesOf(header: Header, name: string): Int32Array {
   return values;
 }
 
-function bytesOf(header: Header, name: string): Uint8Array {
+export function bytesOf(header: Header, name: string): Uint8Array {
   const values = header.arrays.get(name);
   if (!(values instanceof Uint8Array)) throw new Error(`the run has no ${name}`);
   return values;

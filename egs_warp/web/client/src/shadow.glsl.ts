@@ -15,7 +15,7 @@ function discOffset(k: number, count: number): string {
 }
 
 function nearSample(k: number): string {
-  return `near += textureLod(shade, uv + softness * ${discOffset(k, NEAR_SAMPLES)}, 1.5).g;`;
+  return `near += textureLod(shade, uv + softness * ${discOffset(k, NEAR_SAMPLES)}, 1.5).gb;`;
 }
 
 const WIDE_WEIGHTS = Array.from({ length: WIDE_SAMPLES }, (_, k) => Math.exp((-2 * (k + 0.5)) / WIDE_SAMPLES));
@@ -28,12 +28,15 @@ function wideSample(k: number): string {
 
 export const SHADOW_GLSL = /* glsl */ `
 /* Fraction of light at uv of a shadow map. Its red channel is the part of the sky that the body hides, its green
-   channel marks the parts of the body close to the ground. The shadow around a contact is spread over the radius
-   softness. Coarser levels of the map smooth the few samples. */
+   channel marks the parts of the body close to the ground, its blue channel is the shadow of the main light. The
+   shadows around a contact and of the light are spread over the radius softness. Coarser levels of the map smooth the
+   few samples. */
 float egsShade(sampler2D shade, vec2 uv, float softness) {
-  float near = 0.0, wide = 0.0;
+  vec2 near = vec2(0.0);
+  float wide = 0.0;
   ${Array.from({ length: NEAR_SAMPLES }, (_, k) => nearSample(k)).join("\n  ")}
   ${Array.from({ length: WIDE_SAMPLES }, (_, k) => wideSample(k)).join("\n  ")}
-  return (1.0 - 0.45 * near / ${NEAR_SAMPLES}.0) * (1.0 - 0.4 * wide);
+  near /= ${NEAR_SAMPLES}.0;
+  return (1.0 - 0.45 * near.x) * (1.0 - 0.4 * wide) * (1.0 - near.y);
 }
 `;

@@ -46,16 +46,20 @@ interface SplatOptions {
   embedding?: Embedding;
   shadow?: { texture: THREE.Texture; region: THREE.Vector4 };
   hasMarks?: boolean;
+  /** Quadratic form of the irradiance, sixteen numbers, and the normal of each splat at rest as bytes 128 + 127 n. */
+  irradiance?: number[];
+  normals?: Uint8Array;
 }
 
 /** Create splats that are deformed by the maps in `cage`, and placed by their `generator`.
  *
  * Without an `embedding` they are static, and all use the first tetrahedron. A `shadow` darkens the splats near the
- * ground. With `hasMarks`, the colour of a splat depends on the object to which it belongs. */
+ * ground. With `hasMarks`, the colour of a splat depends on the object to which it belongs. With an `irradiance`, the
+ * colour of a splat changes with its normal, which turns with the cage. */
 export function deformedSplats(
   data: SplatData,
   cage: THREE.DataTexture,
-  { embedding, shadow, hasMarks = false }: SplatOptions,
+  { embedding, shadow, hasMarks = false, irradiance, normals }: SplatOptions,
 ): DeformedSplats {
   const { means, rotations, scales, opacities, colours, degree } = data;
   const count = means.length / 3;
@@ -92,6 +96,12 @@ export function deformedSplats(
     shadeRegion: dyno.dynoVec4(shadow?.region ?? new THREE.Vector4(), "egsShadeRegion"),
     eye: dyno.dynoVec3(eye, "egsEye"),
     place: dyno.dynoMat4(place, "egsPlace"),
+    normals: dyno.dynoSampler2D(normals ? normalTexture(normals) : cage, "egsNormals"),
+    // Zero without a main light.
+    irradiance: dyno.dynoMat4(
+      new THREE.Matrix4().fromArray(irradiance ?? new Array<number>(16).fill(0)),
+      "egsIrradiance",
+    ),
     degree: dyno.dynoConst("int", degree),
     marks: dyno.dynoSampler2D(marks?.texture ?? cage, "egsMarks"),
     activeMark,
@@ -111,6 +121,8 @@ export function deformedSplats(
         shadeRegion: "vec4",
         eye: "vec3",
         place: "mat4",
+        normals: "sampler2D",
+        irradiance: "mat4",
         degree: "int",
         marks: "sampler2D",
         activeMark: "int",
@@ -121,7 +133,8 @@ export function deformedSplats(
       globals: () => [dyno.defineGsplat, dyno.defineCovSplat, DEFORM_GLSL, MARK_GLSL],
       statements: ({ inputs: i, outputs }) => [
         `${outputs.covsplat} = egsDeformed(${i.index}, ${i.splats}, ${i.arms}, ${i.bands}, ${i.bandScales}, ` +
-          `${i.cage}, ${i.shade}, ${i.shadeRegion}, ${i.eye}, ${i.place}, ${i.degree}, ${i.maxStretch});`,
+          `${i.cage}, ${i.shade}, ${i.shadeRegion}, ${i.eye}, ${i.place}, ${i.normals}, ` +
+          `${i.irradiance}, ${i.degree}, ${i.maxStretch});`,
         `${outputs.covsplat}.rgba.rgb = ` +
           `egsMarked(${outputs.covsplat}.rgba.rgb, ${i.marks}, ${i.index}, ${i.activeMark});`,
       ],
@@ -160,6 +173,16 @@ function markTexture(count: number): { texture: THREE.DataTexture; values: Uint8
   const texture = new THREE.DataTexture(values, TEXTURE_WIDTH, rows, THREE.RedFormat, THREE.UnsignedByteType);
   texture.needsUpdate = true;
   return { texture, values };
+}
+
+/** Create a texture with one RGB texel per splat. */
+function normalTexture(normals: Uint8Array): THREE.DataTexture {
+  const rows = Math.max(1, Math.ceil(normals.length / 3 / TEXTURE_WIDTH));
+  const values = new Uint8Array(4 * TEXTURE_WIDTH * rows);
+  for (let k = 0; k < normals.length / 3; k++) values.set(normals.subarray(3 * k, 3 * k + 3), 4 * k);
+  const texture = new THREE.DataTexture(values, TEXTURE_WIDTH, rows, THREE.RGBAFormat, THREE.UnsignedByteType);
+  texture.needsUpdate = true;
+  return texture;
 }
 
 /** Create a texture with one RGB texel per coefficient above band 0. */

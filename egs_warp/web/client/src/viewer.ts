@@ -7,7 +7,7 @@ import { splatRenderer, type SplatRenderer } from "./splat_renderer";
 import { fitCamera } from "./fit_camera";
 import { BACKGROUND, FLOOR_DEPTH, Ground } from "./ground";
 import { Overlays, type Layer } from "./overlays";
-import { embeddingOf, floatsOf, indicesOf, splatsOf, type Frame } from "./packets";
+import { bytesOf, embeddingOf, floatsOf, indicesOf, splatsOf, type Frame } from "./packets";
 import type { FrameSource } from "./frame_source";
 import { deformedSplats, type DeformedSplats } from "./splats";
 
@@ -65,6 +65,10 @@ export class Viewer {
     this.splats = deformedSplats(splatsOf(header, "splats"), this.cage.texture, {
       embedding: embeddingOf(header),
       hasMarks: header.facts.picking ?? false,
+      ...(header.facts.light && {
+        irradiance: header.facts.light.irradiance,
+        normals: bytesOf(header, "splats_normals"),
+      }),
     });
     this.splatRenderer = splatRenderer(this.renderer, header.facts.antialiased, () => this.invalidate());
     this.scene.add(this.splatRenderer.spark, this.splats.generator);
@@ -73,7 +77,7 @@ export class Viewer {
     this.bounds = this.runBounds();
     const [start] = source.frames as [Frame];
     this.startCentre = new THREE.Box3().setFromArray(start.positions).getCenter(new THREE.Vector3());
-    this.ground = new Ground(indicesOf(header, "surface"), rest.length / 3, header.facts.height);
+    this.ground = new Ground(indicesOf(header, "surface"), rest.length / 3, header.facts.height, header.facts.light);
     if (header.arrays.has("scene_means")) {
       const { shadow } = this.ground;
       this.background = deformedSplats(splatsOf(header, "scene"), identityCage(), { shadow });

@@ -1,0 +1,65 @@
+"""The main light of a capture: its direction, softness and shadow, and the irradiance of a surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+DISPLAY_GAMMA = 2.2
+"""Exponent that converts a displayed colour, 0 to 1, to linear light."""
+
+
+@dataclass(frozen=True)
+class MainLight:
+    """The strongest light of a capture and the light around it, in the axes of the capture or of the body."""
+
+    direction: np.ndarray
+    """(3,) unit vector to the light."""
+    half_angle: float
+    """Degrees, half of the angle under which the light is seen: the softness of its shadow."""
+    shade: float
+    """Fraction, 0 to 1, of the displayed brightness of the ground that its shadow removes."""
+    irradiance: np.ndarray
+    """(4, 4) symmetric M with E(n) = (n, 1) M (n, 1), the irradiance of a surface with unit normal n up to a factor:
+    spherical harmonics up to order 2 as a quadratic form (Ramamoorthi and Hanrahan 2001, Eq. 11)."""
+
+    def rotated(self, axes: np.ndarray) -> MainLight:
+        """Return the light in other axes, the rows of ``axes`` (3, 3)."""
+        whole = np.eye(4)
+        whole[:3, :3] = axes
+        return replace(self, direction=axes @ self.direction, irradiance=whole @ self.irradiance @ whole.T)
+
+
+def check_light(light: MainLight) -> None:
+    """Raise ``ValueError`` for a light whose numbers are not finite or outside of their ranges."""
+    numbers = np.concatenate([light.direction, light.irradiance.ravel()])
+    is_valid = np.isfinite(numbers).all() and abs(float(np.linalg.norm(light.direction)) - 1.0) < 1e-3
+    is_valid &= 0.0 < light.half_angle < 90.0 and 0.0 <= light.shade < 1.0 and mean_irradiance(light) > 0.0
+    if not is_valid or not np.allclose(light.irradiance, light.irradiance.T):
+        raise ValueError("the light is invalid")
+
+
+def mean_irradiance(light: MainLight) -> float:
+    """Return the mean irradiance of all normals."""
+    return float(light.irradiance[3, 3] + np.trace(light.irradiance[:3, :3]) / 3.0)
+
+
+def irradiance_form(ambient: float, slope: float, up: np.ndarray, key: float, direction: np.ndarray) -> np.ndarray:
+    """Return the quadratic form (4, 4) of an ambient light that changes linearly with height, and of a distant light.
+
+    The form of max(n . l, 0) is its projection onto spherical harmonics of order 2:
+    1/4 + c/2 + 5/32 (3 c^2 - 1) with c = n . l.
+
+    Args:
+        ambient: irradiance of a vertical surface by the ambient light.
+        slope: what a surface that faces up receives in addition, and one that faces down less.
+        up: (3,) unit vector.
+        key: irradiance of a surface that faces the distant light.
+        direction: (3,) unit vector to the distant light.
+    """
+    form = np.zeros((4, 4))
+    form[:3, :3] = key * 15.0 / 32.0 * np.outer(direction, direction)
+    form[:3, 3] = form[3, :3] = 0.5 * (slope * up + 0.5 * key * direction)
+    form[3, 3] = ambient + key * (0.25 - 5.0 / 32.0)
+    return form

@@ -1,0 +1,1 @@
+"""Kernels of ``egs_warp.lighting``."""

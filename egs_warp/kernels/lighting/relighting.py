@@ -1,0 +1,68 @@
+"""Kernel of the relighting: the colour of each Gaussian by the irradiance at its rotated normal.
+
+Host code: ``egs_warp/lighting/relighting.py``.
+"""
+
+import warp as wp
+
+from egs_warp.kernels.render.spherical_harmonics import C0
+
+wp.set_module_options({"enable_backward": False})
+
+_STILL = wp.constant(wp.float32(0.0175))
+"""rad, rotation up to which a Gaussian keeps its colour to the bit: 1 degree, more than a body at rest sags."""
+_TURNED = wp.constant(wp.float32(0.07))
+"""rad, rotation from which the relighting is complete: 4 degrees."""
+_MIN_IRRADIANCE = wp.constant(wp.float32(0.2))
+"""Smallest irradiance, relative to its mean; the quadratic form is slightly negative opposite of a single light."""
+_MAX_RATIO = wp.constant(wp.float32(2.5))
+"""Largest ratio of two irradiances. A captured colour near black or white cannot be scaled by more."""
+
+
+@wp.func
+def irradiance(form: wp.mat44, normal: wp.vec3) -> wp.float32:
+    """Return the irradiance of a surface with the unit ``normal``."""
+    n = wp.vec4(normal[0], normal[1], normal[2], 1.0)
+    return wp.max(wp.dot(n, form * n), _MIN_IRRADIANCE)
+
+
+@wp.kernel
+def relight_kernel(
+    first_row: wp.int32,
+    # In:
+    form: wp.mat44,
+    display_exponent: wp.float32,
+    normals: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    sh: wp.array2d[wp.vec3],
+    # Out:
+    sh_out: wp.array2d[wp.vec3],
+):
+    """Scale the colour of each Gaussian by the ratio of the irradiance after its rotation to that at rest.
+
+    Args:
+        form: quadratic form of the irradiance, of mean 1 over all normals.
+        display_exponent: exponent that converts a ratio of linear light to one of displayed colours.
+        normals: unit normal of each Gaussian at rest; zero where it is not known.
+        rotations: unit quaternions (w, x, y, z) from the rest pose.
+        sh: coefficients of the deformed Gaussians.
+        sh_out: coefficients after relighting; the same bits as ``sh`` where the rotation is below ``_STILL``.
+    """
+    g = wp.tid() + first_row
+    q = rotations[g]
+    axis = wp.vec3(q[1], q[2], q[3])
+    angle = 2.0 * wp.atan2(wp.length(axis), wp.abs(q[0]))
+    share = wp.clamp((angle - _STILL) / (_TURNED - _STILL), 0.0, 1.0)
+    n = normals[g]
+    coefficients = sh.shape[1]
+    if share == 0.0 or wp.dot(n, n) == 0.0:
+        for k in range(coefficients):
+            sh_out[g, k] = sh[g, k]
+        return
+    turned = n + 2.0 * wp.cross(axis, wp.cross(axis, n) + q[0] * n)
+    ratio = wp.clamp(irradiance(form, turned) / irradiance(form, n), 1.0 / _MAX_RATIO, _MAX_RATIO)
+    gain = 1.0 + share * (wp.pow(ratio, display_exponent) - 1.0)
+    half = wp.vec3(0.5, 0.5, 0.5)
+    sh_out[g, 0] = gain * sh[g, 0] + (gain - 1.0) / C0 * half
+    for k in range(1, coefficients):
+        sh_out[g, k] = gain * sh[g, k]

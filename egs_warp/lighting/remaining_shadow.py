@@ -1,0 +1,63 @@
+"""Removal of the shadow that the object cast on the captured ground, which must not stay when the creature moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+from scipy.spatial import KDTree
+
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.geometry.height_field import HeightField
+from egs_warp.geometry.main_light import DISPLAY_GAMMA, MainLight
+from egs_warp.geometry.plane import Plane
+from egs_warp.lighting.evidence import GroundEvidence
+
+_LIT = 0.05
+"""Shadow up to which a cell of the ground counts as lit."""
+_MIN_LIT = 40
+"""Smallest number of lit cells from which the brightness of the others is predicted."""
+_SMOOTH = 12
+"""Neighbouring cells whose darkness is averaged: the texture of the ground stays as captured."""
+_MARGIN = 1.5
+"""Height of Gaussians that are lightened, relative to that of the ground's cells."""
+
+
+def without_shadow(
+    background: GaussianCloud, object_cloud: GaussianCloud, ground: Plane | HeightField, light: MainLight
+) -> GaussianCloud:
+    """Return ``background`` with the ground lightened where it is darker than the lit ground around it predicts.
+
+    No place is lightened by more than the shadow of ``light`` darkens it, so that the shadow of the object at rest
+    restores the captured brightness. A part that was filled without shadow stays as it is.
+
+    Args:
+        background: the capture without the object.
+        object_cloud: the object at rest.
+        ground: ground under the object.
+        light: main light.
+    """
+    evidence = GroundEvidence.of(object_cloud, background, ground)
+    if light.shade <= 0.0 or evidence.causes is None:
+        return background
+    shadow = evidence.shadow(light)
+    lit = shadow < _LIT
+    if lit.sum() < _MIN_LIT or lit.all():
+        return background
+    weights = np.linalg.lstsq(evidence.causes[lit], evidence.log_brightness[lit], rcond=1e-6)[0]
+    darker = evidence.causes @ weights - evidence.log_brightness
+    tree = KDTree(evidence.points)
+    near = tree.query(evidence.points, k=min(_SMOOTH, len(evidence.points)))[1]
+    depth = -DISPLAY_GAMMA * np.log1p(-light.shade)
+    excess = np.clip(darker[near].mean(axis=1), 0.0, depth * shadow)
+    means = background.means.numpy().astype(np.float64)
+    on_ground = np.flatnonzero(np.abs(ground.heights(means)) < _MARGIN * evidence.max_height)
+    distance, cell = tree.query(means[on_ground], distance_upper_bound=2.0 * evidence.cell)
+    found = np.isfinite(distance)
+    rows = on_ground[found]
+    gain = np.exp(excess[cell[found]] / DISPLAY_GAMMA)[:, None]
+    sh = background.sh.numpy().copy()
+    sh[rows] *= gain[:, None]
+    sh[rows, 0] += 0.5 * (gain - 1.0) / SH_BAND_0
+    return replace(background, sh=wp.array(sh, dtype=wp.vec3, device=background.device))

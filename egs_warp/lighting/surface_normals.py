@@ -1,0 +1,43 @@
+"""Smooth outward normals of an object's Gaussians."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from egs_warp.geometry.gaussians import GaussianCloud
+
+_SOLID = 0.3
+"""Opacity from which a Gaussian counts as part of the surface."""
+_MAX_POINTS = 12_000
+"""Points from which normals are computed; the other Gaussians use the nearest of them."""
+_NEAR, _FAR = 40, 320
+"""Neighbours that span a piece of the surface, and that lie behind it: seen from outside, their mean is inside."""
+_MIN_AGREEMENT = 0.6
+"""Length of the mean of neighbouring unit normals below which they give no surface, as in fur or at a thin edge."""
+
+
+def surface_normals(cloud: GaussianCloud) -> np.ndarray:
+    """Return the outward unit normals (n, 3) float64 of the surface that the Gaussians form, zero where there is none.
+
+    A normal is the direction in which the nearest opaque Gaussians spread the least. Single Gaussians of a capture are
+    too noisy for this: their shortest axes deviate from the surface's normal by tens of degrees.
+    """
+    means = cloud.means.numpy().astype(np.float64)
+    chosen = np.flatnonzero(cloud.opacities() > _SOLID)
+    chosen = chosen[:: -(-len(chosen) // _MAX_POINTS) or 1]
+    if len(chosen) <= _NEAR:
+        return np.zeros_like(means)
+    points = means[chosen]
+    tree = KDTree(points)
+    _, near = tree.query(points, k=min(_FAR, len(points)))
+    piece = points[near[:, :_NEAR]]
+    piece = piece - piece.mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", piece, piece))[1][:, :, 0]
+    outward = points - points[near].mean(axis=1)
+    normals *= np.where(np.einsum("ni,ni->n", normals, outward) < 0.0, -1.0, 1.0)[:, None]
+    # A mean over the same neighbours removes normals of the wrong sign.
+    normals = normals[near[:, :_NEAR]].mean(axis=1)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(lengths > _MIN_AGREEMENT, normals / np.maximum(lengths, _MIN_AGREEMENT), 0.0)
+    return normals[tree.query(means)[1]]
