@@ -51,7 +51,8 @@ class Style:
         """Return the text that ``read_style`` reads: a preset's name, or all numbers."""
         values = vars(self)
         same = [name for name, preset in PRESETS.items() if preset == values]
-        return same[0] if same else " ".join(f"{name}={value!r}" for name, value in values.items())
+        numbers = [f"{name}={value!r}" for name, value in values.items() if value or name != "overlap"]
+        return same[0] if same else " ".join(numbers)
 
 
 def span(name: str) -> tuple[float, float]:
@@ -82,7 +83,7 @@ def read_style(text: str) -> Style:
         if not equals and number == 0 and name in PRESETS:
             values |= PRESETS[name]
         elif equals and name in _NAMES:
-            unit = "of the length of a part" if name == "overlap" else "times the usual"
+            unit = "lengths of the part" if name == "overlap" else "times the usual"
             values[name] = Value(name, 1.0, *span(name), unit).parse(value, "style")
         else:
             near = did_you_mean(name, _NAMES if equals else (*PRESETS, *_NAMES))
