@@ -180,13 +180,14 @@ def add_parser(commands: Commands) -> None:
 def complete_help(parser: argparse.ArgumentParser) -> None:
     """Write the names and default values of the registry into the help texts."""
     from egs_warp.motions.repertoire import MOTIONS
-    from egs_warp.motions.style import MAX_FACTOR, MIN_FACTOR, PRESETS, Style
+    from egs_warp.motions.style import MAX_FACTOR, MAX_OVERLAP, MIN_FACTOR, PRESETS, Style
 
     names = ", ".join(f"{name} FILE" if kind.file else name for name, kind in MOTIONS.items())
-    factors = " ".join(f"{name}=1.2" for name in vars(Style()))
+    factors = " ".join(f"{name}=1.2" for name in vars(Style()) if name != "overlap")
     added = {
         "motion": f"one of {names}",
-        "style": f"{', '.join(PRESETS)}, or factors from {MIN_FACTOR:g} to {MAX_FACTOR:g}, as {factors}",
+        "style": f"{', '.join(PRESETS)}, or factors from {MIN_FACTOR:g} to {MAX_FACTOR:g}, as {factors};"
+        f" overlap=0.1 (0 to {MAX_OVERLAP:g}) makes ears, arms and tails soft",
     }
     for target in ("distance", "height", "heading_degrees"):
         defaults = [

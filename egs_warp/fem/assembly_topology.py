@@ -23,6 +23,13 @@ class Material:
     """Mass density at rest, kg/m^3."""
     damping_time: float
     """Coefficient beta of the Rayleigh damping C = beta K at rest, s."""
+    relative_stiffness: np.ndarray | None = None
+    """(T,) Young's modulus of each element relative to ``young_modulus``; None is 1 everywhere."""
+
+    def weighted_volumes(self, volumes: np.ndarray) -> np.ndarray:
+        """Return ``volumes`` (T,) times the relative stiffness: energy, forces and damping of an element are
+        proportional to both, so the kernels need only the product."""
+        return volumes if self.relative_stiffness is None else volumes * self.relative_stiffness
 
     @property
     def mu(self) -> float:

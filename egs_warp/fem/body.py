@@ -186,10 +186,19 @@ def make_body(
         raise ArgumentError("nodes", "parts of the cage are connected by a single corner or edge; request more nodes")
     young *= max(1.0, displacement / (MAX_SAG * height))
     undamped = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
-    frequency = _first_frequency(undamped, node_mass, free)
+    frequency = first_frequency(undamped, node_mass, free)
     damped = Material(young, poisson_ratio, density, 2.0 * damping_ratio / frequency)
     assembly = ElasticAssembly(mesh, damped, device=device)
     return SoftBody(mesh, assembly, node_mass, -GRAVITY * (plane.normal if up is None else up), height)
+
+
+def first_frequency(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.ndarray) -> float:
+    """Return the smallest angular frequency, rad/s, with the nodes that are not ``free`` (N,) clamped."""
+    stiffness, free_coordinates = _clamped_stiffness(assembly, free)
+    mass = sparse.diags(np.repeat(node_mass, 3)[free_coordinates]).tocsc()
+    start = np.ones(len(free_coordinates))
+    value = sparse_linalg.eigsh(stiffness, k=1, M=mass, sigma=0.0, v0=start, return_eigenvectors=False)[0]
+    return float(np.sqrt(value))
 
 
 def _clamped_stiffness(assembly: ElasticAssembly, free: np.ndarray) -> tuple[sparse.csc_matrix, np.ndarray]:
@@ -209,12 +218,3 @@ def _linear_sag(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.ndarr
         warnings.simplefilter("ignore", sparse_linalg.MatrixRankWarning)
         moved[free_coordinates] = sparse_linalg.spsolve(stiffness, force[free_coordinates])
     return float(node_mass @ moved.reshape(-1, 3) @ gravity / (node_mass.sum() * np.linalg.norm(gravity)))
-
-
-def _first_frequency(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.ndarray) -> float:
-    """Return the smallest angular frequency, rad/s, with the nodes that are not ``free`` (N,) clamped."""
-    stiffness, free_coordinates = _clamped_stiffness(assembly, free)
-    mass = sparse.diags(np.repeat(node_mass, 3)[free_coordinates]).tocsc()
-    start = np.ones(len(free_coordinates))
-    value = sparse_linalg.eigsh(stiffness, k=1, M=mass, sigma=0.0, v0=start, return_eigenvectors=False)[0]
-    return float(np.sqrt(value))

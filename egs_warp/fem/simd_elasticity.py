@@ -47,7 +47,9 @@ class SimdElasticity:
         elements = kernels.Elements()
         elements.corners = wp.array(maps.tets[padded].ravel(), dtype=int, device=device)
         elements.rests = wp.array(np.ascontiguousarray(rests).ravel(), dtype=real, device=device)
-        elements.volumes = wp.array(np.r_[maps.volumes, np.zeros(more)], dtype=real, device=device)
+        elements.volumes = wp.array(
+            np.r_[material.weighted_volumes(maps.volumes), np.zeros(more)], dtype=real, device=device
+        )
         elements.entries = wp.array(_entries_of_pairs(maps)[padded].ravel(), dtype=int, device=device)
         elements.mu, elements.lam, elements.damping_time = material.mu, material.lam, material.damping_time
         self.elements = elements

@@ -88,7 +88,7 @@ class WarpElasticity:
         self._node_count, self._tet_count = len(maps.corner_offsets) - 1, len(maps.tets)
         self._tets = wp.array(maps.tets, dtype=wp.vec4i, device=device)
         self._rest_inverses = wp.array(maps.rest_inverses, dtype=Mat33, device=device)
-        self._volumes = wp.array(maps.volumes, dtype=real, device=device)
+        self._volumes = wp.array(material.weighted_volumes(maps.volumes), dtype=real, device=device)
         self._corners, self._blocks_of = (
             [wp.array(part, dtype=int, device=device) for part in parts]
             for parts in (

@@ -228,7 +228,7 @@ class _Elements:
     rest_inverses: np.ndarray
     """(T, 3, 3) inverses of the rest edge matrices, 1/m."""
     volumes: np.ndarray
-    """(T,) m^3, volumes at rest."""
+    """(T,) m^3, volumes at rest times the relative stiffness, to which all terms of an element are proportional."""
     mu: float
     """Pa, Lame parameter."""
     lam: float
@@ -241,7 +241,10 @@ class _Elements:
         edges = _edges(t.unloaded_positions, t.tets)
         young, nu = t.young_modulus, t.poisson_ratio
         mu, lam = young / (2.0 * (1.0 + nu)), young * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
-        return cls(t.tets, np.linalg.inv(edges), np.linalg.det(edges) / 6.0, mu, lam, t.damping_time)
+        volumes = np.linalg.det(edges) / 6.0
+        if len(t.relative_stiffness):
+            volumes = volumes * t.relative_stiffness
+        return cls(t.tets, np.linalg.inv(edges), volumes, mu, lam, t.damping_time)
 
     def gradients(self, positions: np.ndarray) -> np.ndarray:
         """Return (T, 3, 3) F at ``positions`` (N, 3)."""

@@ -157,6 +157,8 @@ class Recorder:
                 "ground_spacing": np.float64(geometry.field.spacing),
                 "ground_coefficients": geometry.field.coefficients,
             }
+        if material.relative_stiffness is not None:
+            part["relative_stiffness"] = material.relative_stiffness
         if frame is not None:
             part |= {
                 "body_axes": frame.axes,

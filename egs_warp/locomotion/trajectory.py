@@ -134,6 +134,8 @@ class Trajectory:
     """Length of the capture's unit, m."""
     front: np.ndarray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
     """(3,) unit vector along the ground in which the body at rest faces; x in files without it."""
+    relative_stiffness: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """(T,) Young's modulus of each element relative to ``young_modulus``; empty if it is the same everywhere."""
 
     def in_capture(self, points: np.ndarray) -> np.ndarray:
         """Return ``points`` (..., 3) of this frame in the capture's frame and unit."""

@@ -58,7 +58,7 @@ _INDICES = {
     "kick_step": "steps",
 }
 """Arrays of integers, each below this extent."""
-_POSITIVE = ("node_mass", "height", "metres_per_unit", "ground_spacing", "dt")
+_POSITIVE = ("node_mass", "height", "metres_per_unit", "ground_spacing", "dt", "relative_stiffness")
 _MAY_BE_NAN = ("planned_com", "min_gap")
 """Arrays that may contain NaN: where there is no plan or no contact point."""
 
@@ -117,6 +117,8 @@ def _extents(t: Trajectory) -> dict[str, int]:
     is_wrong = extents["states"] != extents["steps"] + 1 or extents["planned"] not in (0, extents["states"])
     if is_wrong or min(extents[name] for name in ("nodes", "tets", "planes", "offsets")) < 1:
         raise ValueError("its arrays have inconsistent shapes")
+    if t.relative_stiffness.shape not in ((0,), (extents["tets"],)):
+        raise ValueError(f"relative_stiffness has shape {t.relative_stiffness.shape}")
     # May be absent if the run has no pushes.
     has_no_pushes = extents["kicks"] == 0 and t.kick_velocity.shape == (0, 0, 3)
     if t.kick_velocity.shape != (extents["kicks"], extents["nodes"], 3) and not has_no_pushes:

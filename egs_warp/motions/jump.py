@@ -358,7 +358,8 @@ class Jump:
     def _land(self, state: BodyState, measurement: Measurement, dt: float) -> list[AnyObjective]:
         rate = self.plan.landing_rate
         goal = np.array([*(measurement.foot_centre - self.controller.base_offset), self.landing_height])
-        acceleration = rate**2 * (goal - measurement.com) - 2.0 * rate * measurement.velocity
+        damping = 2.0 * self.plan.landing_damping * rate
+        acceleration = rate**2 * (goal - measurement.com) - damping * measurement.velocity
         acceleration[2] = max(acceleration[2], -0.8 * self.gravity)
         acceleration[:2] = self.controller.capture_acceleration(measurement, goal[:2])
         velocity = measurement.velocity + dt * acceleration

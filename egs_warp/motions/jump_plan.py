@@ -84,7 +84,9 @@ class JumpPlan:
     landing_lag: float
     """Distance of the centre of mass behind its standing position over the feet at touch-down."""
     landing_rate: float
-    """1/s, rate of the critically damped descent on landing."""
+    """1/s, natural frequency of the descent on landing."""
+    landing_damping: float
+    """Damping ratio of the descent on landing; below 1, the body rises above its standing height before it settles."""
 
     @property
     def _down(self) -> np.ndarray:
@@ -263,4 +265,5 @@ def plan_jump(
         lean=float(lean),
         landing_lag=float(speed_forward * capture_time - footprint_help),
         landing_rate=float(4.0 / (style.squash * time_unit)),
+        landing_damping=float(style.bounce**-2),
     )

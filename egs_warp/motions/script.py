@@ -284,6 +284,8 @@ def _own_style(text: Any, name: str, where: str) -> Style | None:
         raise UserError(f'{where}: "style" is {json.dumps(text)}; give a text, such as "heavy" or "squash=1.2"')
     if not _kind(name, where).jumps:
         raise UserError(f"{where}: {name} does not jump, so it has no style; jump, hop, twist and dance have one")
+    if "overlap" in text:
+        raise UserError(f"{where}: overlap belongs to the body; give it in the style of the whole run")
     try:
         return read_style(text)
     except UserError as error:

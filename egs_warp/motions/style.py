@@ -5,49 +5,65 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
+import numpy as np
+
 from egs_warp.errors import ArgumentError, did_you_mean
 from egs_warp.motions.values import Value
 
 MIN_FACTOR, MAX_FACTOR = 0.5, 2.0
 """Smallest and largest factor; outside this range no body could make the stroke of the jump."""
+MAX_OVERLAP = 0.5
+"""Largest overlap; the tip of a part that sags by half of its length swings as far as the part is long."""
 
 
 @dataclass(frozen=True)
 class Style:
-    """Factors of a jump, relative to the default.
+    """Factors of a jump, relative to the default, and the softness of the parts that stick out of the body.
 
     Raises:
-        ArgumentError: for a factor below 0.5 or above 2.
+        ArgumentError: for a factor below 0.5 or above 2, or an overlap below 0 or above 0.5.
     """
 
     anticipation: float = 1.0
     """Depth and duration of the crouch."""
     squash: float = 1.0
     """Time in which the fall is stopped on landing, which determines the compression."""
+    bounce: float = 1.0
+    """Swing of the body about its standing height after the landing: the damping ratio is 1 / bounce^2."""
     timing: float = 1.0
     """Duration of crouch and thrust: below 1 they are quick and hard."""
+    overlap: float = 0.0
+    """Softness of the parts that stick out of the body (``CreatureOptions.overlap``); no factor. It is a property of
+    the body, so a motion in this style does not change it."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not MIN_FACTOR <= value <= MAX_FACTOR:
-                raise ArgumentError(name, f"give a number from {MIN_FACTOR:g} to {MAX_FACTOR:g}", value=value)
+            low, high = span(name)
+            if not low <= value <= high:
+                raise ArgumentError(name, f"give a number from {low:g} to {high:g}", value=value)
 
     def scaled(self, factors: Mapping[str, float]) -> Style:
         """Return the style with its numbers multiplied by ``factors``, within the bounds."""
         scaled = {name: value * factors.get(name, 1.0) for name, value in vars(self).items()}
-        return Style(**{name: min(max(value, MIN_FACTOR), MAX_FACTOR) for name, value in scaled.items()})
+        return Style(**{name: float(np.clip(value, *span(name))) for name, value in scaled.items()})
 
     def __str__(self) -> str:
         """Return the text that ``read_style`` reads: a preset's name, or all numbers."""
         values = vars(self)
         same = [name for name, preset in PRESETS.items() if preset == values]
-        return same[0] if same else " ".join(f"{name}={value!r}" for name, value in values.items())
+        numbers = [f"{name}={value!r}" for name, value in values.items() if value or name != "overlap"]
+        return same[0] if same else " ".join(numbers)
+
+
+def span(name: str) -> tuple[float, float]:
+    """Return the smallest and the largest value of the number ``name`` of a style."""
+    return (0.0, MAX_OVERLAP) if name == "overlap" else (MIN_FACTOR, MAX_FACTOR)
 
 
 PRESETS: Mapping[str, Mapping[str, float]] = {
-    "light": {"anticipation": 0.8, "squash": 0.7, "timing": 0.8},
-    "heavy": {"anticipation": 1.3, "squash": 1.4, "timing": 1.25},
-    "rubbery": {"anticipation": 1.5, "squash": 1.8, "timing": 1.0},
+    "light": {"anticipation": 0.8, "squash": 0.7, "bounce": 1.0, "timing": 0.8, "overlap": 0.05},
+    "heavy": {"anticipation": 1.3, "squash": 1.4, "bounce": 1.0, "timing": 1.25, "overlap": 0.12},
+    "rubbery": {"anticipation": 1.5, "squash": 1.8, "bounce": 1.4, "timing": 1.0, "overlap": 0.25},
 }
 _NAMES = tuple(field.name for field in fields(Style))
 
@@ -67,7 +83,8 @@ def read_style(text: str) -> Style:
         if not equals and number == 0 and name in PRESETS:
             values |= PRESETS[name]
         elif equals and name in _NAMES:
-            values[name] = Value(name, 1.0, MIN_FACTOR, MAX_FACTOR, "times the usual").parse(value, "style")
+            unit = "lengths of the part" if name == "overlap" else "times the usual"
+            values[name] = Value(name, 1.0, *span(name), unit).parse(value, "style")
         else:
             near = did_you_mean(name, _NAMES if equals else (*PRESETS, *_NAMES))
             raise ArgumentError("style", f"unknown word {word!r}{near}; give {_usage()}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -215,7 +215,8 @@ def animate(
     ffmpeg_program()
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
         with preparation_bar(quiet=quiet) as begin_stage:
-            creature = make_creature(cloud, up=up, plane=plane, options=options.creature, progress=begin_stage)
+            creature_options = replace(options.creature, overlap=max(options.creature.overlap, jump_style.overlap))
+            creature = make_creature(cloud, up=up, plane=plane, options=creature_options, progress=begin_stage)
             balance = None
             if options.creature.muscles_file is not None:
                 begin_stage("balance")

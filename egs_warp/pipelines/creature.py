@@ -13,6 +13,7 @@ from egs_warp.contact.terrain import Solid, Surface
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
+from egs_warp.fem.soft_parts import bending_frequency, stiffness_at_nodes, with_soft_parts
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
@@ -28,11 +29,12 @@ from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_f
 from egs_warp.meshing.cage import Cage, cage_of_body, cage_of_mesh
 from egs_warp.meshing.cage_file import read_cage_in
 from egs_warp.meshing.occupancy import solid_from_gaussians
+from egs_warp.meshing.protrusions import find_protrusions
 from egs_warp.motions.feet import SupportKind, support_kind_of
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import GroundFrame
-from egs_warp.motions.style import Style
+from egs_warp.motions.style import MAX_OVERLAP, Style
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
 from egs_warp.pipelines.facing_direction import Front, find_front
@@ -41,6 +43,9 @@ from egs_warp.short_repr import short_repr
 
 MIN_SAG = 0.004
 """Fraction of the height: a body that its weight bends is made stiffer until its sag is below this."""
+_STRENGTH_POWER = 3
+"""Power of the relative stiffness to which the strength of automatic muscles is proportional. In proportion to the
+stiffness itself, they brake the swing of a soft part before it returns."""
 MAX_SLOPE = 45.0
 """Degrees; steeper ground is rejected."""
 _GROUND_SPACING = 0.5
@@ -68,6 +73,10 @@ class CreatureOptions:
     sag: float = DEFAULT_SAG
     """Fraction of its height by which the body sags under its weight, which defines its stiffness. A body that its
     weight would bend out of shape is made stiffer."""
+    overlap: float = 0.0
+    """Fraction of its length by which a part that sticks out (an ear, an arm, a tail; ``find_protrusions``) would sag
+    under its weight, 0 to 0.5, which defines its stiffness: it lags behind the body and settles after it. 0 leaves the
+    stiffness of the body."""
     nodes: int = 500
     """Approximate number of cage nodes."""
     cage_file: Path | None = None
@@ -94,6 +103,9 @@ class CreatureOptions:
         if not 0.0 <= self.friction <= MAX_FRICTION:
             advice = f"give a Coulomb coefficient from 0 to {MAX_FRICTION:g}"
             raise ArgumentError("friction", advice, value=self.friction)
+        if not 0.0 <= self.overlap <= MAX_OVERLAP:
+            advice = f"give a fraction of the length of a part from 0 to {MAX_OVERLAP:g}"
+            raise ArgumentError("overlap", advice, value=self.overlap)
         if self.metres_per_unit is not None and not 1e-9 <= self.metres_per_unit <= 1e9:
             # The bounds keep lengths within the range of single precision; ``make_body`` checks the height of the body.
             advice = "give a positive number, from 1e-9 to 1e9"
@@ -124,6 +136,8 @@ class Creature:
     """Surfaces that the body can touch, the ground first."""
     notes: tuple[str, ...] = ()
     """Guesses about the capture, for the user."""
+    overlap: float = 0.0
+    """Softness of the parts that stick out (``CreatureOptions``)."""
 
     def placed(self, cloud: GaussianCloud) -> GaussianCloud:
         """Transform another cloud of the same capture, such as its background, to the frame of the body."""
@@ -253,6 +267,7 @@ def creature_in_cage(
     while True:
         progress("body and muscles")
         body = make_body(cage.mesh, GROUND, up=against_gravity, sag=sag, device=device)
+        body = _with_overlap(body, standing.limbs, options.overlap)
         muscles = body_muscles(body, options.muscles_file, frame)
         stepper = LocomotionStepper(body, muscles, geometry, settings=options.settings, device=device)
         progress("stand")
@@ -260,7 +275,9 @@ def creature_in_cage(
         if is_stiff_enough or sag < MIN_SAG:
             surfaces = (field or Solid((GROUND,)), *solids)
             placed = to_body_frame(cloud, frame)
-            return Creature(frame, placed, facing, standing.limbs, cage, stepper, start, surfaces, notes)
+            return Creature(
+                frame, placed, facing, standing.limbs, cage, stepper, start, surfaces, notes, options.overlap
+            )
         sag *= 0.5
 
 
@@ -303,6 +320,7 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
     body, geometry = creature.body, replace(creature.geometry, friction=friction)
     up = -body.gravity / np.linalg.norm(body.gravity)
     new_body = make_body(creature.cage.mesh, GROUND, up=up, sag=sag, device=device)
+    new_body = _with_overlap(new_body, creature.limbs, creature.overlap)
     muscles = body_muscles(new_body, muscles_file, creature.frame)
     stepper = LocomotionStepper(new_body, muscles, geometry, settings=creature.stepper.settings, device=device)
     stepper, start, _ = _rest_state(stepper, creature.limbs)
@@ -431,7 +449,7 @@ def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleS
     """
     if file is not None:
         return read_muscles(file, body.mesh, body_weight=body.weight, frame=frame)
-    return automatic_muscles(
+    muscles = automatic_muscles(
         body.mesh,
         GROUND.normal,
         body_weight=body.weight,
@@ -439,6 +457,30 @@ def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleS
         strength=4.0 * body.stiffening,
         young_modulus=body.young_modulus,
     )
+    if body.assembly.material.relative_stiffness is None:
+        return muscles
+    relative = (muscles.end_rows @ stiffness_at_nodes(body))[muscles.segments].mean(axis=1)
+    return replace(muscles, stiffness=muscles.stiffness * relative**_STRENGTH_POWER)
+
+
+def _with_overlap(body: SoftBody, limbs: Limbs, overlap: float) -> SoftBody:
+    """Return ``body`` with soft parts that stick out (``CreatureOptions.overlap``).
+
+    A body that keeps the captured shape as its unloaded one (``_rest_state``) stays as it is: its parts would droop.
+    """
+    if overlap == 0.0 or _keeps_shape(body, limbs):
+        return body
+    parts = find_protrusions(body.mesh, GROUND.normal)
+    gravity = float(np.linalg.norm(body.gravity))
+    return with_soft_parts(
+        body, [part.nodes for part in parts], [bending_frequency(overlap, part.length, gravity) for part in parts]
+    )
+
+
+def _keeps_shape(body: SoftBody, limbs: Limbs) -> bool:
+    """Return True for a body on a round base, or one that lies along the ground."""
+    kind = support_kind_of(body.mesh, body.mesh.nodes[:, 2], limbs.count)
+    return kind in (SupportKind.ROUND_BASE, SupportKind.LYING)
 
 
 def _rest_state(stepper: LocomotionStepper, limbs: Limbs) -> tuple[LocomotionStepper, BodyState, bool]:
@@ -450,10 +492,10 @@ def _rest_state(stepper: LocomotionStepper, limbs: Limbs) -> tuple[LocomotionSte
     Returns:
         The stepper with the unloaded shape; the state at rest; and False if the body is too soft for that.
     """
-    start, mesh = settle(stepper), stepper.body.mesh
+    start = settle(stepper)
     if not _stands(stepper, start):
         return stepper, start, False
-    if support_kind_of(mesh, mesh.nodes[:, 2], limbs.count) in (SupportKind.ROUND_BASE, SupportKind.LYING):
+    if _keeps_shape(stepper.body, limbs):
         return stepper, start, True
     # The unloaded shape belongs to the body: it does not depend on the friction of the ground.
     friction = stepper.geometry.friction

@@ -21,7 +21,7 @@ from egs_warp.motions.style import MAX_FACTOR, MIN_FACTOR, PRESETS, Style
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.simulated_run import FILMED_FROM
-from egs_warp.web.messages import MAX_FRICTION, MAX_SAG, MIN_SAG, read_message
+from egs_warp.web.messages import MAX_FRICTION, MAX_SAG, MIN_SAG, STYLE_NAMES, read_message
 from egs_warp.web.packets import Frame
 from egs_warp.web.recording import CURVES, creature_header, curve_facts
 from egs_warp.web.session import Session
@@ -71,7 +71,10 @@ class LiveFeed:
             "motion": [],
             "notes": [],
             "limits": {"friction": [0.0, MAX_FRICTION], "sag": [MIN_SAG, MAX_SAG], "style": [MIN_FACTOR, MAX_FACTOR]},
-            "styles": {"usual": vars(Style()), **{name: dict(style) for name, style in PRESETS.items()}},
+            "styles": {
+                name: {key: style[key] for key in STYLE_NAMES}
+                for name, style in {"usual": vars(Style()), **PRESETS}.items()
+            },
         }
         planes = np.array([[*plane.normal, plane.offset] for plane in creature.geometry.planes])
         deformer = Deformer(render_data.splats, embed_gaussians(render_data.splats, mesh))

@@ -24,8 +24,8 @@ MIN_SAG, MAX_SAG = 0.01, 0.1
 """Limits of the sag rho g H / E of a column: the stiffest and the softest body."""
 MAX_FRICTION = 2.0
 """Maximum Coulomb coefficient."""
-STYLE_NAMES = tuple(field.name for field in fields(Style))
-"""Names of the style factors."""
+STYLE_NAMES = tuple(field.name for field in fields(Style) if field.name != "overlap")
+"""Names of the style factors; a session keeps the overlap of its body."""
 _MOTIONS = re.compile(r"[A-Za-z0-9_=+\-., ]+")
 """Characters allowed in the text of motions."""
 

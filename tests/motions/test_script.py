@@ -187,6 +187,7 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
             '[{"motion": "hop"}, {"motion": "jump", "style": "floppy"}]',
             ", motion 2: style: unknown word 'floppy'; give",
         ),
+        ('[{"motion": "jump", "style": "overlap=0.2"}]', ", motion 1: overlap belongs to the body; give it in"),
         ('[{"motion": "walk", "style": "heavy"}]', ", motion 1: walk does not jump, so it has no style; jump, hop"),
         (f'[{{"motion": "jump", "repeat": {5000 * "1"}}}]', '"repeat" is inf; give a whole number'),
     ],

@@ -37,6 +37,8 @@ class Jumped:
     """Rise above the standing height."""
     dip: float
     """Descent below the standing height after touch-down."""
+    rebound: float
+    """Rise above the standing height after that."""
     heights: tuple[float, ...]
 
 
@@ -57,12 +59,13 @@ def jumped(style: str | None) -> Jumped:
     left, met = borne[flight], borne[flight + 1]
     lowest = int(rise[:left].argmin())
     times = float(t.time[lowest]), float(t.time[left])
-    return Jumped(-rise[lowest], *times, rise.max(), -rise[met:].min(), tuple(height.tolist()))
+    dip = met + int(rise[met:].argmin())
+    return Jumped(-rise[lowest], *times, rise.max(), -rise[dip], rise[dip:].max(), tuple(height.tolist()))
 
 
 @pytest.mark.slow
 def test_the_usual_style_changes_no_bit() -> None:
-    assert jumped(None).heights == jumped("anticipation=1 squash=1 timing=1").heights
+    assert jumped(None).heights == jumped("anticipation=1 squash=1 bounce=1 timing=1 overlap=0").heights
 
 
 @pytest.mark.slow
@@ -89,6 +92,13 @@ def test_timing_makes_a_thrust_soft() -> None:
     np.testing.assert_allclose([other.thrust_time / usual.thrust_time for other in others], [0.7, 1.4], rtol=1e-6)
     assert others[0].speed_up == others[1].speed_up == usual.speed_up
     assert jumped("timing=1.4").take_off - jumped("timing=1.4").lowest > jumped(None).take_off - jumped(None).lowest
+
+
+@pytest.mark.slow
+def test_a_bouncing_landing_rises_above_the_standing_height() -> None:
+    usual, bouncing = jumped("squash=1.5"), jumped("squash=1.5 bounce=1.6")
+    assert usual.rebound < 0.002 and bouncing.rebound > 0.005
+    assert bouncing.apex == usual.apex
 
 
 @pytest.mark.slow
@@ -140,6 +150,7 @@ def test_presets_can_be_changed() -> None:
     for name, values in PRESETS.items():
         assert read_style(name) == Style(**values)
         assert str(Style(**values)) == name
+    assert "overlap" not in str(Style(squash=1.3))
     mine = Style(anticipation=0.1 + 0.7, timing=1 / 1.5)
     assert read_style(str(mine)) == mine and read_style(str(Style())) == Style()
 
@@ -154,6 +165,7 @@ def test_presets_can_be_changed() -> None:
         ("squash=3", "style: squash 3: give a number of times the usual from 0.5 to 2"),
         ("timing=fast", "style: timing fast: give a number of times the usual from 0.5 to 2"),
         ("timing=nan", "style: timing nan: give a number of times the usual from 0.5 to 2"),
+        ("overlap=0.6", "style: overlap 0.6: give a number of lengths of the part from 0 to 0.5"),
     ],
 )
 def test_a_bad_style_is_a_one_line_error(text: str, said: str) -> None:

@@ -54,6 +54,7 @@ export interface MainLight {
 export interface Style {
   anticipation: number;
   squash: number;
+  bounce: number;
   timing: number;
 }
 

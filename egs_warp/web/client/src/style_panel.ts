@@ -9,6 +9,7 @@ const STEP = 0.05;
 const FIELDS: [keyof Style, string, string][] = [
   ["anticipation", "Anticipation", "Depth and duration of the crouch before a jump"],
   ["squash", "Squash", "Compression of the body on landing"],
+  ["bounce", "Bounce", "Swing of the body about its standing height after a landing"],
   ["timing", "Timing", "Duration of crouch and thrust; smaller is faster and harder"],
 ];
 
@@ -16,8 +17,8 @@ export class StylePanel {
   readonly elements: HTMLElement[];
   private readonly styles: Record<string, Style>;
   private readonly buttons = new Map<string, HTMLButtonElement>();
-  private readonly sliders: Record<keyof Style, Slider>;
-  private style: Style = { anticipation: 1, squash: 1, timing: 1 };
+  private readonly sliders: Map<keyof Style, Slider>;
+  private style: Style = { anticipation: 1, squash: 1, bounce: 1, timing: 1 };
 
   /** `onChange` is called with the style that the user chooses. */
   constructor(
@@ -44,7 +45,7 @@ export class StylePanel {
       slider.element.title = hint;
       return [name, slider] as const;
     });
-    this.sliders = Object.fromEntries(sliders) as Record<keyof Style, Slider>;
+    this.sliders = new Map(sliders);
     this.elements = [row, ...sliders.map(([, slider]) => slider.element)];
     this.show(this.style);
   }
@@ -52,7 +53,7 @@ export class StylePanel {
   /** Show the style reported by the session. */
   show(style: Style): void {
     this.style = style;
-    for (const [name] of FIELDS) this.sliders[name].show(Math.log(style[name]));
+    for (const [name, slider] of this.sliders) slider.show(Math.log(style[name]));
     for (const [name, button] of this.buttons) {
       const same = FIELDS.every(([number]) => Math.abs(this.styles[name]![number] - style[number]) < 0.5 * STEP);
       button.setAttribute("aria-pressed", String(same));

@@ -1,0 +1,59 @@
+"""Parts of a body that are softer than the rest, so that they lag behind its motion and settle after it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from egs_warp.fem.body import SoftBody, first_frequency
+from egs_warp.fem.elasticity import ElasticAssembly
+
+MIN_RELATIVE_STIFFNESS = 0.02
+"""Smallest Young's modulus of a part, relative to that of the body."""
+_CANTILEVER = 12.362 / 8.0
+"""w^2 d / g of a uniform cantilever with first frequency w whose tip sags by d under its weight: 1.875^4 / 8."""
+
+
+def bending_frequency(sag: float, length: float, gravity: float) -> float:
+    """Return the first angular frequency (rad/s) of a uniform cantilever of ``length`` (m) whose tip sags by the
+    fraction ``sag`` of its length under its own weight; ``gravity`` is in m/s^2."""
+    return float(np.sqrt(_CANTILEVER * gravity / (sag * length)))
+
+
+def with_soft_parts(body: SoftBody, parts: Sequence[np.ndarray], frequencies: Sequence[float]) -> SoftBody:
+    """Return ``body`` with softer parts.
+
+    The elements that touch a part get a smaller Young's modulus, so that the first frequency of the part with all
+    other nodes clamped is the requested one; a part whose frequency is lower already stays as it is. Damping is
+    proportional to stiffness, so the damping ratio of a part is that of ``make_body`` times its frequency, divided by
+    the first frequency of the body.
+
+    Args:
+        body: the body.
+        parts: (k,) indices of the nodes of each part.
+        frequencies: rad/s, for each part.
+    """
+    assembly, mesh = body.assembly, body.assembly.mesh
+    relative = np.ones(len(mesh.tets))
+    for part, frequency in zip(parts, frequencies, strict=True):
+        free = np.zeros(len(mesh.nodes), dtype=bool)
+        free[part] = True
+        stiffness = (frequency / first_frequency(assembly, body.node_mass, free)) ** 2
+        elements = free[mesh.tets].any(axis=1)
+        relative[elements] = np.minimum(relative[elements], np.clip(stiffness, MIN_RELATIVE_STIFFNESS, 1.0))
+    if (relative == 1.0).all():
+        return body
+    material = replace(assembly.material, relative_stiffness=relative)
+    return replace(body, assembly=ElasticAssembly(mesh, material, device=str(assembly.device)))
+
+
+def stiffness_at_nodes(body: SoftBody) -> np.ndarray:
+    """Return the mean relative stiffness (N,) of the elements around each node, weighted by their volumes."""
+    relative, mesh = body.assembly.material.relative_stiffness, body.mesh
+    if relative is None:
+        return np.ones(len(mesh.nodes))
+    corners, volumes = mesh.tets.ravel(), np.repeat(mesh.volumes(), 4)
+    weighted = np.bincount(corners, volumes * np.repeat(relative, 4), len(mesh.nodes))
+    return weighted / np.bincount(corners, volumes, len(mesh.nodes))
