@@ -79,6 +79,12 @@ class Bundle:
 
 def write_bundle(path: Path, bundle: Bundle) -> None:
     """Write a bundle. Raises ``UserError`` if the file cannot be written."""
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(bundle_file(bundle))
+
+
+def bundle_file(bundle: Bundle) -> bytes:
+    """Return the bytes of the file of a bundle."""
     pieces: list[bytes] = []
     start = 0
 
@@ -126,8 +132,7 @@ def write_bundle(path: Path, bundle: Bundle) -> None:
         },
         separators=(",", ":"),
     ).encode()
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(b"".join([HEAD.pack(MAGIC, VERSION, len(text)), text, *pieces]))
+    return b"".join([HEAD.pack(MAGIC, VERSION, len(text)), text, *pieces])
 
 
 def read_bundle(path: Path) -> Bundle:
