@@ -118,7 +118,7 @@ def _weights(cage: TetMesh, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarra
     would follow the gradient; it follows the nearest point of its tetrahedron."""
     embedding = embed_points(cage, vertices, device="cpu")
     weights = np.maximum(embedding.weights.numpy(), 0.0)
-    # glTF asks for joint 0 where the weight is 0.
+    # glTF requires joint 0 where the weight is 0.
     nodes = np.where(weights > 0.0, embedding.nodes.numpy(), 0)
     return nodes, weights / weights.sum(axis=1, keepdims=True)
 

@@ -65,7 +65,7 @@ def test_the_surface_of_the_cage_moves_as_in_the_run(run: FinishedRun, run_folde
     path = tmp_path / "a.glb"
     assert main(["export", str(run_folder), "--to", "skin", "--out", str(path), "--every", "4"]) == 0
     skin = _Skin(path)
-    used = np.unique(run.mesh.boundary_faces())
+    used: np.ndarray = np.unique(run.mesh.boundary_faces().ravel())
     times = skin.array(skin.text["animations"][0]["samplers"][0]["input"])[:, 0]
     np.testing.assert_allclose(times, np.arange(0, 13, 4) / 60.0, rtol=1e-6)
     for key, frame in ((0, 0), (3, 12)):
