@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     browser = os.environ.get("EGS_WARP_BROWSER") or shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         parser.error("Chromium was not found; install it, or set EGS_WARP_BROWSER")
-    seconds = 5.0 if options.quick else 15.0
+    seconds = 5.0 if options.quick else 10.0
     table = Table(gaussians="8d", nodes="5d", bundle_MB=".2f", first_picture_s=".2f", pictures_a_second=".2f", MB=".0f")
     rows: list[Row] = []
     for requested in NODES.values():
