@@ -102,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             axes.semilogy([row["run"] for row in rows], [row[kind] for row in rows], "o", label=kind)
         axes.set(ylabel="MB")
         axes.tick_params(axis="x", labelsize=6)
-        axes.legend()
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
     whole = all(50.0 * row["bundle"] <= row["sog"] for row in rows)
     second = all(50.0 * row["second"] <= row["sog"] / row["frames"] * FRAME_RATE for row in rows)
