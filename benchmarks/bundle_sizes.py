@@ -1,4 +1,4 @@
-"""Size of a bundle beside those of numbered .ply, numbered .sog and one USD stage, for finished runs.
+"""Size of a bundle beside those of numbered .ply, .sog and .spz and of one USD stage, for finished runs.
 
 Numbered files of a run differ little in size: three of them are written, and their mean is multiplied by the number of
 frames. A USD stage grows by the same amount with each frame: two stages with few frames are written, and the difference
@@ -27,7 +27,8 @@ from harness import Row, Table, flags, report
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FORMATS = ("ply", "sog", "usd", "bundle")
+NUMBERED = ("ply", "sog", "spz")
+FORMATS = (*NUMBERED, "usd", "bundle")
 
 
 def numbered_size(run: FinishedRun, kind: str, folder: Path) -> float:
@@ -62,7 +63,7 @@ def sizes_of(run: FinishedRun) -> Row:
         export_bundle(run, folder / "all.egs")
         body = read_valid_file(folder / "all.egs").text["bodies"][0]
         motion = sum(entry["bytes"] for block in body["blocks"] for entry in block["arrays"].values())
-        row: Row = {kind: numbered_size(run, kind, folder) / 1e6 for kind in ("ply", "sog")}
+        row: Row = {kind: numbered_size(run, kind, folder) / 1e6 for kind in NUMBERED}
         row |= {"usd": stage_size(run, folder) / 1e6, "bundle": (folder / "all.egs").stat().st_size / 1e6}
     splats = run.creature.splats
     return {
@@ -73,6 +74,7 @@ def sizes_of(run: FinishedRun) -> Row:
         "frames": count,
         **row,
         "second": motion / count * FRAME_RATE / 1e6,
+        "seconds": count / FRAME_RATE,
     }
 
 
@@ -83,20 +85,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     use_device(options.device)
     sizes = {f"{kind}_MB": "8.2f" for kind in FORMATS}
-    table = Table(run="<24", gaussians="7d", nodes="5d", frames="6d", **sizes, MB_a_second="7.2f")
+    table = Table(
+        run="<24", gaussians="7d", nodes="5d", frames="6d", **sizes, MB_a_second="7.2f", sog_over_bundle=".1f"
+    )
     rows = []
     for folder in options.runs[:1] if options.quick else options.runs:
         row = sizes_of(FinishedRun.read(folder))
         rows.append(row)
         counts = (row["gaussians"], row["nodes"], row["frames"])
-        table.row(row["run"], *counts, *(row[kind] for kind in FORMATS), row["second"])
+        part = row["sog"] / row["bundle"]
+        table.row(row["run"], *counts, *(row[kind] for kind in FORMATS), row["second"], part)
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         for kind in FORMATS:
             axes.semilogy([row["run"] for row in rows], [row[kind] for row in rows], "o", label=kind)
         axes.set(ylabel="MB")
-        axes.legend()
+        axes.tick_params(axis="x", labelsize=6)
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
     whole = all(50.0 * row["bundle"] <= row["sog"] for row in rows)
     second = all(50.0 * row["second"] <= row["sog"] / row["frames"] * FRAME_RATE for row in rows)

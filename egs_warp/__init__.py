@@ -65,6 +65,7 @@ if TYPE_CHECKING:
         render_views,
     )
     from egs_warp.training.metrics import psnr
+    from egs_warp.web.notebook import show
 
 _MODULES: dict[str, tuple[str, ...]] = {
     "assets.scene": ("BUILT_IN_SCENES", "Scene", "scene"),
@@ -120,6 +121,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
         "render_views",
     ),
     "training.metrics": ("psnr",),
+    "web.notebook": ("show",),
 }
 """Module of each public name; the imports above declare the same for type checkers."""
 _MODULE_OF = {name: f"egs_warp.{module}" for module, names in _MODULES.items() for name in names}
@@ -198,6 +200,7 @@ __all__ = [
     "render_torch",
     "render_views",
     "scene",
+    "show",
     "simulate",
     "simulate_many",
     "train",

@@ -12,6 +12,7 @@ EXAMPLES = (
     "out/jump --to ply --out frames --every 2",
     "out/jump --to usd --out jump.usdc",
     "out/jump --to bundle --out jump.egs",
+    "out/jump --to skin --out jump.glb",
     "out/jump --to glb --out still.glb --frame 40",
 )
 _WITHOUT_ANTIALIASING = ("splat", "usd")
@@ -25,24 +26,30 @@ def add_parser(commands: Commands) -> None:
     export.add_argument(
         "--to",
         required=True,
-        choices=(*SPLAT_FILES, "usd", "bundle"),
-        help="output format: numbered splat files, one USD stage (usd), or one .egs file (bundle)",
+        choices=(*SPLAT_FILES, "usd", "bundle", "skin"),
+        help="output format: numbered splat files, one USD stage (usd), one .egs file (bundle), or a mesh in glTF that "
+        "the cage moves (skin)",
     )
     export.add_argument(
         "--out",
         required=True,
         type=named_path,
         help="folder for numbered files, or a file for a single --frame; a .usdc or .usda file for usd; an .egs file "
-        "for bundle",
+        "for bundle; a .glb file for skin",
     )
     export.add_argument("--every", type=int, default=1, metavar="N", help="write every N-th frame of the 60 Hz run (1)")
     export.add_argument(
-        "--frame", type=int, help="write only this frame, counted from 0, -1 is the last; not for usd and bundle"
+        "--frame", type=int, help="write only this frame, counted from 0, -1 is the last; not for usd, bundle and skin"
     )
     export.add_argument(
         "--degree", type=int, choices=(0, 1, 2, 3), help="highest degree of spherical harmonics to write (all)"
     )
     export.add_argument("--licence", default="", metavar="TEXT", help="licence of the capture, which a bundle states")
+    export.add_argument(
+        "--mesh",
+        type=named_path,
+        help="triangles to move in a skin, in the capture's frame and units (the cage's surface)",
+    )
     export.set_defaults(run=_export)
 
 
@@ -51,13 +58,16 @@ def _export(args: argparse.Namespace) -> int:
     from egs_warp.pipelines.bundle import export_bundle
     from egs_warp.pipelines.export import export_splats
     from egs_warp.pipelines.finished_run import FinishedRun
+    from egs_warp.pipelines.skin import export_skin
     from egs_warp.pipelines.usd import export_usd
 
-    if args.to in ("usd", "bundle") and args.frame is not None:
-        format_name = "USD stage" if args.to == "usd" else "bundle"
+    if args.to in ("usd", "bundle", "skin") and args.frame is not None:
+        format_name = "USD stage" if args.to == "usd" else args.to
         raise UserError(f"--frame: a {format_name} contains all frames; leave --frame out, or give --every")
     if args.licence and args.to != "bundle":
         raise UserError("--licence: only a bundle states a licence; leave --licence out")
+    if args.mesh is not None and args.to != "skin":
+        raise UserError("--mesh: only a skin moves a mesh; leave --mesh out, or give --to skin")
     use_device("cpu")
     run = FinishedRun.read(args.folder)
     if args.to == "usd":
@@ -65,6 +75,9 @@ def _export(args: argparse.Namespace) -> int:
         paths = [args.out]
     elif args.to == "bundle":
         export_bundle(run, args.out, every=args.every, degree=args.degree, licence=args.licence)
+        paths = [args.out]
+    elif args.to == "skin":
+        export_skin(run, args.out, every=args.every, mesh=args.mesh)
         paths = [args.out]
     else:
         paths = export_splats(run, args.out, args.to, frame=args.frame, every=args.every, degree=args.degree)

@@ -19,6 +19,9 @@ from egs_warp.version import __version__
 
 BLOCK_FRAMES = 60
 """Number of frames of a block; a player starts when it has the first block."""
+_BAND_STEP = 1.0 / 64.0
+"""Step of the coefficients of the bands above 0, unless their largest needs more than 127 of them. Finer steps are
+noise that cannot be deflated: half of a bundle."""
 _ROTATION_STEP, _SCALE_STEP, _COLOUR_STEP, _ARM_STEP = 1.0 / 512.0, 1.0 / 128.0, 1.0 / 512.0, 1.0 / 4096.0
 """Steps of rotation vectors in rad, log scales, colours, and of bulges and lengths of arms in standard deviations."""
 
@@ -79,6 +82,12 @@ class Bundle:
 
 def write_bundle(path: Path, bundle: Bundle) -> None:
     """Write a bundle. Raises ``UserError`` if the file cannot be written."""
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(bundle_file(bundle))
+
+
+def bundle_file(bundle: Bundle) -> bytes:
+    """Return the bytes of the file of a bundle."""
     pieces: list[bytes] = []
     start = 0
 
@@ -126,8 +135,7 @@ def write_bundle(path: Path, bundle: Bundle) -> None:
         },
         separators=(",", ":"),
     ).encode()
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(b"".join([HEAD.pack(MAGIC, VERSION, len(text)), text, *pieces]))
+    return b"".join([HEAD.pack(MAGIC, VERSION, len(text)), text, *pieces])
 
 
 def read_bundle(path: Path) -> Bundle:
@@ -175,7 +183,7 @@ def _splat_arrays(cloud: GaussianCloud) -> dict[str, PackedArray]:
     }
     if cloud.sh_degree > 0:
         bands = sh[:, 1:].transpose(0, 2, 1)
-        step = np.maximum(np.abs(bands).max(axis=(0, 1)), 1e-6) / (BAND_ZERO - 1)
+        step = np.maximum(np.abs(bands).max(axis=(0, 1)) / (BAND_ZERO - 1), _BAND_STEP)
         arrays["bands"] = quantised(bands, np.uint8, step=step, lower=-BAND_ZERO * step)
     return arrays
 

@@ -7,6 +7,7 @@ caller must provide.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.gltf import BINARY_CHUNK, EXTENSION, JSON_CHUNK, MAGIC
+from egs_warp.version import __version__
 
 _FLOAT = 5126
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
@@ -55,9 +57,9 @@ def write_glb(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | No
     node: dict[str, object] = {"mesh": 0, "name": "creature"}
     if origin is not None:
         node["translation"] = origin.tolist()
-    text = json.dumps(
+    write_container(
+        path,
         {
-            "asset": {"version": "2.0", "generator": "egs_warp"},
             "extensionsUsed": [EXTENSION],
             "scene": 0,
             "scenes": [{"nodes": [0]}],
@@ -78,13 +80,25 @@ def write_glb(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | No
                 {"buffer": 0, "byteOffset": start, "byteLength": len(piece), "target": 34962}
                 for start, piece in zip(starts, pieces, strict=False)
             ],
-            "buffers": [{"byteLength": starts[-1]}],
-        }
-    ).encode()
-    text += b" " * (-len(text) % 4)
-    binary = b"".join(pieces)
+        },
+        b"".join(pieces),
+    )
+
+
+def write_container(path: Path | str, text: Mapping[str, object], binary: bytes) -> None:
+    """Write a binary glTF file. Raises ``UserError`` if it cannot be written.
+
+    Args:
+        path: The file.
+        text: Properties of the JSON text; ``asset`` and ``buffers`` are added.
+        binary: The buffer.
+    """
+    asset = {"version": "2.0", "generator": f"egs_warp {__version__}"}
+    encoded = json.dumps({"asset": asset, **text, "buffers": [{"byteLength": len(binary)}]}).encode()
+    encoded += b" " * (-len(encoded) % 4)
+    padded = binary + b"\0" * (-len(binary) % 4)
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        file.write(np.array([MAGIC, 2, 28 + len(text) + len(binary), len(text), JSON_CHUNK], "<u4").tobytes())
-        file.write(text)
-        file.write(np.array([len(binary), BINARY_CHUNK], "<u4").tobytes())
-        file.write(binary)
+        file.write(np.array([MAGIC, 2, 28 + len(encoded) + len(padded), len(encoded), JSON_CHUNK], "<u4").tobytes())
+        file.write(encoded)
+        file.write(np.array([len(padded), BINARY_CHUNK], "<u4").tobytes())
+        file.write(padded)

@@ -6,14 +6,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from egs_warp.deformation.deformer import Deformer
 from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import with_degree
+from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.bundle import Bundle, BundleBody, BundleCage, write_bundle
 from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.export import chosen_frames
 from egs_warp.pipelines.finished_run import FinishedRun
 
@@ -44,15 +49,34 @@ def export_bundle(
 def bundle_of(run: FinishedRun, *, every: int = 1, degree: int | None = None, licence: str = "") -> Bundle:
     """Return the bundle of ``run``: its creature, and its scene as a static body. The arguments are those of
     ``export_bundle``."""
-    frames = chosen_frames(run, frame=None, every=every)
-    t, camera = run.trajectory, run.creature.camera
-    cage = _cage(run, t.positions[run.steps[frames]])
-    bodies = [BundleBody("creature", with_degree(run.creature.splats, degree), cage)]
+    steps = run.steps[chosen_frames(run, frame=None, every=every)]
+    bodies = [_moving_body(run.deformer(), run.trajectory, steps, degree)]
     if run.scene is not None:
         bodies.append(BundleBody("scene", with_degree(run.scene, degree)))
-    facts = {
-        "title": run.title,
-        "licence": licence,
+    facts = _facts(run.trajectory, run.creature.camera, run.title) | {"licence": licence}
+    return Bundle(tuple(bodies), FRAME_RATE / every, len(steps), facts)
+
+
+def bundle_of_motion(
+    deformer: Deformer, trajectory: Trajectory, steps: np.ndarray, camera: Camera, *, title: str
+) -> Bundle:
+    """Return the bundle of a motion that has no files.
+
+    Args:
+        deformer: Deformer of the Gaussians.
+        trajectory: The motion.
+        steps: (F,) states that are the frames, at 60 Hz.
+        camera: First view.
+        title: Name of the bundle.
+    """
+    body = _moving_body(deformer, trajectory, steps, None)
+    return Bundle((body,), FRAME_RATE, len(steps), _facts(trajectory, camera, title))
+
+
+def _facts(t: Trajectory, camera: Camera, title: str) -> dict[str, Any]:
+    return {
+        "title": title,
+        "licence": "",
         "up": [0.0, 0.0, 1.0],
         "metres_per_unit": 1.0,
         "height": t.height,
@@ -69,17 +93,15 @@ def bundle_of(run: FinishedRun, *, every: int = 1, degree: int | None = None, li
             "metres_per_unit": t.metres_per_unit,
         },
     }
-    return Bundle(tuple(bodies), FRAME_RATE / every, len(frames), facts)
 
 
-def _cage(run: FinishedRun, nodes: np.ndarray) -> BundleCage:
-    """Return the cage of ``run`` with the positions ``nodes`` (F, N, 3)."""
-    deformer = run.deformer()
-    return BundleCage(
-        rest_nodes=run.trajectory.rest_positions.astype(np.float32),
-        cage_tets=run.trajectory.tets,
-        surface=run.mesh.boundary_faces(),
+def _moving_body(deformer: Deformer, t: Trajectory, steps: np.ndarray, degree: int | None) -> BundleBody:
+    cage = BundleCage(
+        rest_nodes=t.rest_positions.astype(np.float32),
+        cage_tets=t.tets,
+        surface=TetMesh(t.rest_positions, t.tets).boundary_faces(),
         max_stretch=deformer.max_stretch,
-        nodes=nodes,
+        nodes=t.positions[steps],
         **deformer.plan_arrays(),
     )
+    return BundleBody("creature", with_degree(deformer.rest, degree), cage)

@@ -16,7 +16,8 @@ from egs_warp.io.sequence import frame_paths
 from egs_warp.io.writing import WRITERS, is_capture_name, writer_of
 from egs_warp.pipelines.finished_run import FinishedRun
 
-_Y_UP = BodyFrame(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3), 1.0)
+Y_UP = BodyFrame(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3), 1.0)
+"""Axes of glTF in the frame of a body."""
 
 
 def chosen_frames(run: FinishedRun, *, frame: int | None, every: int) -> np.ndarray:
@@ -72,7 +73,7 @@ def export_splats(
         # Several single frames may be in one folder.
         paths = frame_paths(target, frames, write.ending, alone=frame is None)
     deformer = run.deformer()
-    place = _Y_UP if kind == "glb" else run.capture_frame
+    place = Y_UP if kind == "glb" else run.capture_frame
     for index, path in zip(tqdm(frames, desc="export", unit="frame", disable=quiet), paths, strict=True):
         cloud = to_body_frame(deformer.deform(run.trajectory.positions[run.steps[index]]).cloud, place)
         write(path, with_degree(cloud, degree))

@@ -126,16 +126,9 @@ def draw_film(
     cameras = shot.cameras(camera, trajectory, steps, in_scene=scene is not None)
     # The whole motion is known, so Gaussians are split before the first frame and no frame shows a sudden change.
     started = time.perf_counter()
-    keys = simulation.frames[:: max(1, len(simulation.frames) // SPLIT_KEY_FRAMES)]
-    embedding = embed_gaussians(creature.cloud, creature.cage.mesh)
-    cloud = creature.cloud
-    if scene is None and trajectory.ground_coefficients.size == 0:
-        # Haze of the captured ground, which would be seen below the creature in the air.
-        cloud = hidden_below(cloud, GROUND, margin=_BELOW_GROUND * trajectory.height)
-    split = split_for_motion(cloud, embedding, [trajectory.positions[step] for step in keys])
-    deformer = drawn = Deformer(split.cloud, split.embedding)
-    if max_gaussians is not None and split.cloud.count > max_gaussians:
-        visible = most_visible(split.cloud, max_gaussians)
+    deformer = drawn = split_deformer(performance, in_scene=scene is not None)
+    if max_gaussians is not None and deformer.rest.count > max_gaussians:
+        visible = most_visible(deformer.rest, max_gaussians)
         drawn = Deformer(visible, embed_gaussians(visible, creature.cage.mesh))
     splitting = 1e3 * (time.perf_counter() - started)
     frames = drawn_frames(
@@ -170,6 +163,24 @@ def draw_film(
     write_png(run.file("sheet.png"), contact_sheet(sheet_images, 4, labels))
     milliseconds["split"] = [splitting / len(steps)]
     return Film(path.name, deformer, camera, milliseconds)
+
+
+def split_deformer(performance: SimulatedRun, *, in_scene: bool = False) -> Deformer:
+    """Return the deformer of the Gaussians of a run, split for its motion.
+
+    Args:
+        performance: The simulated run.
+        in_scene: True if a captured scene is drawn around the creature.
+    """
+    creature, simulation = performance.creature, performance.simulation
+    trajectory, cloud = simulation.trajectory, creature.cloud
+    keys = simulation.frames[:: max(1, len(simulation.frames) // SPLIT_KEY_FRAMES)]
+    embedding = embed_gaussians(cloud, creature.cage.mesh)
+    if not in_scene and trajectory.ground_coefficients.size == 0:
+        # Haze of the captured ground, which would be seen below the creature in the air.
+        cloud = hidden_below(cloud, GROUND, margin=_BELOW_GROUND * trajectory.height)
+    split = split_for_motion(cloud, embedding, [trajectory.positions[step] for step in keys])
+    return Deformer(split.cloud, split.embedding)
 
 
 def drawn_frames(

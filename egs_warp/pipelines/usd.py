@@ -1,4 +1,4 @@
-"""Export of a finished run to a USD stage: splats, cage, muscles and contact forces, with time samples at 60 Hz."""
+"""Export of a finished run to a USD stage: splats, cage, soft body, muscles and forces, with time samples at 60 Hz."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.pipelines.export import chosen_frames
 from egs_warp.pipelines.finished_run import FinishedRun
+from egs_warp.pipelines.usd_body import define_body
 
 SPLATS, CAGE, MUSCLES, FORCES, SCENE = "splats", "cage", "muscles", "forces", "scene"
 _WIDTH = 0.004
@@ -30,7 +31,7 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
     """Write ``run`` to a USD file in metres, with z up and 60 time codes per second.
 
     Splats are a ParticleField3DGaussianSplat, which OpenUSD has had since 26.03; the cage is a mesh, muscles and
-    forces are curves.
+    forces are curves, and the body is a tetrahedral mesh with its material (``usd_body``).
 
     Args:
         run: The run to export.
@@ -76,17 +77,18 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
         )
         forces = _curves(UsdGeom.BasisCurves.Define(stage, f"/creature/{FORCES}"), UsdGeom)
         weight = float(t.node_mass.sum() * np.linalg.norm(t.gravity))
+        body = define_body(stage, "/creature", t)
         deformer = run.deformer()
         for index in tqdm(frames, desc="export", unit="frame", disable=quiet):
             step, code = int(run.steps[index]), float(index)
             positions = t.positions[step]
             cloud = with_degree(deformer.deform(positions).cloud, degree)
-            if index == 0:
-                # The default value, for programs and validators that do not specify a time.
-                _write_sample(splats, cloud, Usd.TimeCode.Default(), Vt)
-            _write_sample(splats, cloud, code, Vt)
-            _set_points(cage, positions, code, Vt)
-            cage.GetNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(_normals(positions[faces])), code)
+            # The default value, for programs and validators that do not specify a time.
+            for at in (Usd.TimeCode.Default(), code) if index == 0 else (code,):
+                _write_sample(splats, cloud, at, Vt)
+                _set_points(cage, positions, at, Vt)
+                _set_points(body, positions, at, Vt)
+                cage.GetNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(_normals(positions[faces])), at)
             ends = run.creature.muscle_ends @ positions
             _set_points(muscles, ends[segments].reshape(-1, 3), code, Vt, width=_WIDTH)
             activation.Set(Vt.FloatArray.FromNumpy(run.activations(step).astype(np.float32)), code)

@@ -16,6 +16,7 @@ from egs_warp.io.run_folder import MANIFEST, run_folder
 from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.sequence import MotionRecord
 from egs_warp.pipelines import render_data
@@ -73,6 +74,10 @@ class SessionRecording:
         """Recorded simulated time, s."""
         return self.reports[-1].state.time - self.start.time if self.reports else 0.0
 
+    def trajectory(self) -> Trajectory:
+        """Return the recorded steps; without any, the state at the start alone."""
+        return self._recorder.trajectory()
+
     def add(self, reports: Sequence[StepReport], *, kick: np.ndarray | None) -> None:
         """Append steps.
 
@@ -105,7 +110,7 @@ class SessionRecording:
             requested: options of the session, for the report.
             drive_starts: times in s at which the user started to drive the body.
         """
-        trajectory = self._recorder.trajectory()
+        trajectory = self.trajectory()
         recorded = [
             (entry, request)
             for entry, request in zip(records, requests, strict=True)

@@ -1,0 +1,197 @@
+"""Speed and memory of ``<egs-player>`` in headless Chromium, for bundles of several sizes.
+
+A cage that was simulated for a jump carries more or fewer Gaussians of the same pawn. The page plays the film in a
+square of 480 pixels. Each new picture deforms and sorts all Gaussians. On a machine without a GPU, Chromium draws them
+on the CPU (SwiftShader), and ``renderer`` of the JSON says so.
+
+Aims: ``first_picture`` (2 s for 20,000 Gaussians), ``film`` (25 pictures per second for 20,000 Gaussians).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from egs_warp.assets.pawn import pawn
+from egs_warp.deformation.deformer import Deformer
+from egs_warp.deformation.embedding import embed_gaussians
+from egs_warp.io.bundle import write_bundle
+from egs_warp.launching import use_device
+from egs_warp.pipelines.bundle import bundle_of_motion
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
+from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
+from egs_warp.web.player import player_script
+from harness import Row, Table, flags, report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+GAUSSIANS = (20_000, 200_000, 1_000_000)
+NODES = {250: 170, 500: 420}
+"""Approximate number of nodes, and the one to request from the mesher for it."""
+SIDE = 480
+"""Width and height of the element, pixels."""
+_BODY_GAUSSIANS = 20_000
+"""Gaussians of the capture from which the cage is made."""
+
+LOAD = """async (side) => {
+    window.started = performance.now();
+    const player = document.createElement("egs-player");
+    player.setAttribute("loop", "");
+    player.style.width = `${side}px`;
+    const ready = new Promise((resolve, reject) => {
+        player.addEventListener("canplay", () => resolve(performance.now() - window.started));
+        player.addEventListener("error", (event) => reject(new Error(event.message)));
+    });
+    player.setAttribute("src", "film.egs");
+    document.body.append(player);
+    window.player = player;
+    return await ready;
+}"""
+"""Script that opens the bundle and returns the milliseconds to its first picture."""
+
+PLAY = """async (seconds) => {
+    const { view } = player;
+    let drawn = 0;
+    const draw = view.draw;
+    // The element draws only what has changed; the call returns true for a new picture.
+    view.draw = () => { const isNew = draw.call(view); drawn += isNew; return isNew; };
+    const gl = view.canvas.getContext("webgl2");
+    player.play();
+    const began = performance.now();
+    await new Promise((resolve) => setTimeout(resolve, 1000 * seconds));
+    player.pause();
+    // The pictures that were requested are complete.
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    delete view.draw;
+    const name = gl.getExtension("WEBGL_debug_renderer_info");
+    return {
+        fps: 1000 * drawn / (performance.now() - began),
+        renderer: gl.getParameter(name ? name.UNMASKED_RENDERER_WEBGL : gl.RENDERER),
+    };
+}"""
+"""Script that plays and returns the new pictures per second."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark."""
+    parser = flags(__doc__, quick="only 20,000 Gaussians, 5 s each", device="cpu")
+    options = parser.parse_args(arguments)
+    use_device(options.device)
+    browser = os.environ.get("EGS_WARP_BROWSER") or shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        parser.error("Chromium was not found; install it, or set EGS_WARP_BROWSER")
+    seconds = 5.0 if options.quick else 10.0
+    table = Table(gaussians="8d", nodes="5d", bundle_MB=".2f", first_picture_s=".2f", pictures_a_second=".2f", MB=".0f")
+    rows: list[Row] = []
+    for requested in NODES.values():
+        performance = _jump(requested)
+        for count in GAUSSIANS[:1] if options.quick else GAUSSIANS:
+            with tempfile.TemporaryDirectory() as name:
+                facts = _write(performance, count, Path(name))
+                row = facts | measured(Path(name), browser, seconds)
+            rows.append(row)
+            values = (row[key] for key in ("gaussians", "nodes", "bundle_MB", "first_picture_s", "fps", "memory_MB"))
+            table.row(*values)
+    small = rows[0]
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for nodes in sorted({row["nodes"] for row in rows}):
+            chosen = [row for row in rows if row["nodes"] == nodes]
+            counts = [row["gaussians"] for row in chosen]
+            axes.loglog(counts, [row["fps"] for row in chosen], "o-", label=f"{nodes} nodes")
+        axes.set(xlabel="Gaussians", ylabel="pictures per second")
+        axes.legend()
+
+    report(
+        options,
+        rows,
+        aims={"first_picture": small["first_picture_s"] <= 2.0, "film": small["fps"] >= 25.0},
+        conditions={"renderer": small["renderer"], "load_average": os.getloadavg(), "cores": os.cpu_count()},
+        packages=("playwright",),
+        draw=draw,
+    )
+
+
+def _jump(nodes: int) -> SimulatedRun:
+    built = pawn(gaussian_count=_BODY_GAUSSIANS)
+    creature = make_creature(built.cloud, plane=built.plane, options=CreatureOptions(nodes=nodes))
+    return simulate(creature, "jump 0.5", frames=60)
+
+
+def _write(performance: SimulatedRun, count: int, folder: Path) -> Row:
+    """Write the page and the bundle of about ``count`` Gaussians into ``folder``; return their sizes."""
+    creature, trajectory = performance.creature, performance.trajectory
+    cloud = creature.placed(pawn(gaussian_count=count).cloud)
+    deformer = Deformer(cloud, embed_gaussians(cloud, creature.cage.mesh))
+    frames = performance.simulation.frames
+    bundle = bundle_of_motion(deformer, trajectory, frames, performance.camera(SIDE), title="jump")
+    write_bundle(folder / "film.egs", bundle)
+    (folder / "player.js").write_text(player_script(), encoding="utf-8")
+    page = '<!doctype html><link rel="icon" href="data:,"><script type="module" src="player.js"></script><body>'
+    (folder / "index.html").write_text(page, encoding="utf-8")
+    size = (folder / "film.egs").stat().st_size / 1e6
+    return {"gaussians": cloud.count, "nodes": len(trajectory.rest_positions), "bundle_MB": size}
+
+
+def measured(folder: Path, browser: str, seconds: float) -> Row:
+    """Return the time to the first picture, the pictures per second and the memory of the page in ``folder``."""
+    from playwright.sync_api import sync_playwright
+
+    with _served(folder) as address, sync_playwright() as started:
+        arguments = ["--enable-unsafe-swiftshader", "--no-sandbox"]
+        chromium = started.chromium.launch(executable_path=browser, args=arguments)
+        page = chromium.new_page(viewport={"width": 640, "height": 640})
+        page.set_default_timeout(600_000)
+        page.goto(address)
+        page.evaluate("customElements.whenDefined('egs-player')")
+        before = _memory(chromium)
+        first = page.evaluate(LOAD, SIDE)
+        played = page.evaluate(PLAY, seconds)
+        memory = _memory(chromium) - before
+        chromium.close()
+    return {"first_picture_s": first / 1e3, "fps": played["fps"], "memory_MB": memory, "renderer": played["renderer"]}
+
+
+def _memory(chromium: Any) -> float:
+    """Return the proportional set size of all processes of the browser, MB; it counts shared pages once."""
+    session = chromium.new_browser_cdp_session()
+    processes = session.send("SystemInfo.getProcessInfo")["processInfo"]
+    session.detach()
+    total = 0
+    for process in processes:
+        text = Path(f"/proc/{process['id']}/smaps_rollup").read_text()
+        total += next(int(line.split()[1]) for line in text.splitlines() if line.startswith("Pss:"))
+    return total * 1024 / 1e6
+
+
+@contextmanager
+def _served(folder: Path) -> Iterator[str]:
+    handler = partial(_QuietHandler, directory=str(folder))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/index.html"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+class _QuietHandler(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        """Print nothing."""
+
+
+if __name__ == "__main__":
+    main()
