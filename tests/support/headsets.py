@@ -16,6 +16,7 @@ HEAD = (0.3, 1.6, -0.2)
 _SET_UP = """(() => {
     const device = new IWER.XRDevice(IWER.metaQuest3);
     device.installRuntime({ forceInstall: true, polyfillLayers: true });
+    device.stereoEnabled = true;
     device.position.set(%s);
     // The specification passes a transform; iwer 2.5 reads a matrix.
     const { getOffsetReferenceSpace } = XRReferenceSpace.prototype;

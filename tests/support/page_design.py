@@ -1,4 +1,4 @@
-"""What every control of a page must have: a label, a tooltip, a place in the window and a visible focus."""
+"""Requirements on the controls of a page: label, tooltip, place in the window and visible focus."""
 
 from __future__ import annotations
 

@@ -92,17 +92,20 @@ def _images(page: Any, count: int = 4) -> None:
     )
 
 
-def _nodes(page: Any) -> np.ndarray:
-    """Return the nodes (N, 3) of the body in the room of the emulated headset: y up, its floor at 0."""
+def _in_room(page: Any, points: Any = None) -> np.ndarray:
+    """Return points (N, 3) of the scene in the room of the emulated headset, which has y up and its floor at 0.
+
+    Without ``points``, those are the nodes of the body.
+    """
     cameras, positions = page.evaluate(_READ)
     poses = np.reshape(cameras, (2, 4, 4)).transpose(0, 2, 1)
     # The head is not turned, and between its eyes.
     rotation, eye = poses[0, :3, :3], poses[:, :3, 3].mean(axis=0)
-    return np.array(HEAD) + (np.reshape(positions, (-1, 3)) - eye) @ rotation
+    return np.array(HEAD) + (np.reshape(positions if points is None else points, (-1, 3)) - eye) @ rotation
 
 
 def _middle(page: Any) -> np.ndarray:
-    nodes = _nodes(page)
+    nodes = _in_room(page)
     return 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
 
 
@@ -136,7 +139,7 @@ def test_a_run_stands_on_the_floor_of_a_headset_at_its_real_size(chromium: Any, 
     with _view(chromium, site) as page:
         before = page.evaluate("[stage.camera.position.toArray(), stage.canvas.width]")
         _enter(page, "VR")
-        nodes = _nodes(page)
+        nodes = _in_room(page)
         assert abs(nodes[:, 1].min()) < 0.01
         assert np.ptp(nodes[:, 1]) == pytest.approx(np.ptp(recording.trajectory.positions[0][:, 2]), rel=1e-4)
         # In front of the head, which looks along -z.
@@ -158,7 +161,7 @@ def test_a_run_stands_on_the_real_floor_with_its_shadow(
     with _view(chromium, site, hit=hit) as page:
         _enter(page, "AR")
         floor = 0.0 if hit is None else hit[1]
-        assert abs(_nodes(page)[:, 1].min() - floor) < 0.01
+        assert abs(_in_room(page)[:, 1].min() - floor) < 0.01
         if hit is not None:
             np.testing.assert_allclose(_middle(page)[[0, 2]], np.array(hit)[[0, 2]], atol=0.1)
         page.evaluate("device.quaternion.set(Math.sin(-0.25), 0, 0, Math.cos(-0.25))")
@@ -187,7 +190,7 @@ def test_selecting_a_place_moves_the_user_or_the_creature(chromium: Any, site: s
             # The user steps to the place, so that it comes under the head; or the creature comes to the place.
             expected = np.array(HEAD) - place if kind == "VR" else place - before
             np.testing.assert_allclose(moved[[0, 2]], expected[[0, 2]], atol=0.05)
-            assert abs(_nodes(page)[:, 1].min()) < 0.01
+            assert abs(_in_room(page)[:, 1].min()) < 0.01
             page.evaluate("stage.headset.leave()")
             wait_until(page, "!stage.headset.isPresenting")
 
@@ -212,7 +215,7 @@ def test_selecting_the_floor_sends_a_live_creature_there(chromium: Any, session:
         wait_until(page, "egs.live.state?.resting")
         page.evaluate(KEEP_SENT)
         _enter(page, "VR")
-        assert abs(_nodes(page)[:, 1].min()) < 0.01
+        assert abs(_in_room(page)[:, 1].min()) < 0.01
         before = _middle(page)
         place = np.array([before[0] + 0.5, 0.0, before[2]])
         _point(page, "right", place)
@@ -220,11 +223,7 @@ def test_selecting_the_floor_sends_a_live_creature_there(chromium: Any, session:
         _press(page, "right", "trigger", on=False)
         wait_until(page, "egs.live.state?.goal !== null")
         (sent,) = page.evaluate("sent.filter(({ type }) => type === 'go')")
-        cameras, _ = page.evaluate(_READ)
-        poses = np.reshape(cameras, (2, 4, 4)).transpose(0, 2, 1)
-        room = np.array(HEAD) + (np.array([sent["x"], sent["y"], 0.0]) - poses[:, :3, 3].mean(axis=0)) @ poses[0, :3, :3]
-        np.testing.assert_allclose(room, place, atol=1e-3)
-        # It goes there, and the user stays.
+        np.testing.assert_allclose(_in_room(page, [sent["x"], sent["y"], 0.0]), [place], atol=1e-3)
         wait_until(page, "egs.live.state?.doing !== 'stand' || egs.live.state?.motions > 0")
 
 
@@ -240,7 +239,7 @@ def test_the_player_enters_and_leaves_both(chromium: Any, site: str):
     page.evaluate("window.stage = one.view")
     for kind in ("VR", "AR"):
         _enter(page, kind)
-        assert abs(_nodes(page)[:, 1].min()) < 0.01
+        assert abs(_in_room(page)[:, 1].min()) < 0.01
         assert page.evaluate("stage.ground.mesh.visible") == (kind == "VR")
         page.evaluate("stage.headset.leave()")
         wait_until(page, "!stage.headset.isPresenting")

@@ -311,6 +311,9 @@ _COUNT_RESOURCES = """() => {
 
 def _memory(page: Any) -> tuple[float, dict[str, int]]:
     """Return the memory that scripts use, array buffers included, in MB, and the number of objects of WebGL."""
+    # Without a sort, whose buffers would be in transfer between the page and a worker.
+    page.evaluate("for (const player of document.querySelectorAll('egs-player')) player.pause()")
+    wait_until(page, "[...document.querySelectorAll('egs-player')].every(({ view }) => !view.sorting)")
     session = page.context.new_cdp_session(page)
     for _ in range(3):
         session.send("HeapProfiler.collectGarbage")
@@ -333,7 +336,7 @@ def test_memory_is_flat_over_a_hundred_loops_of_two_players(chromium: Any, site:
     _wait_until_ready(page)
     wait_until(page, "loops >= 20")
     before, resources = _memory(page)
-    page.evaluate("loops = 0")
+    page.evaluate("loops = 0; one.play(); two.play()")
     wait_until(page, "loops >= 200", seconds=240)
     after, resources_after = _memory(page)
     assert resources_after == resources
@@ -345,7 +348,7 @@ def test_memory_is_flat_over_a_hundred_loops_of_two_players(chromium: Any, site:
     page.wait_for_timeout(500)
     again, resources_again = _memory(page)
     assert again - after < 3.0, (after, again)
-    print(before, after, again, resources, resources_again)
+    assert resources_again == resources
     assert complaints == []
     page.close()
 

@@ -94,7 +94,7 @@ export class Bodies {
     for (const { splats } of this.moving) splats.mark(labels, active);
   }
 
-  /** Generate the moving splats anew. */
+  /** Regenerate the moving splats. */
   update(): void {
     for (const { splats } of this.moving) splats.update();
   }

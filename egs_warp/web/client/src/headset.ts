@@ -10,7 +10,7 @@ import type { Stage } from "./stage";
 const UP = new THREE.Vector3(0, 1, 0);
 /** Turns the axes of the scene to those of a headset. */
 const Z_UP_TO_Y_UP = new THREE.Quaternion().setFromAxisAngle(new THREE.Vector3(1, 0, 0), -Math.PI / 2);
-/** Distance of the creature from the user at the start: at least so many metres and body heights. */
+/** Distance of the creature from the user at the start: at least this number of metres, and of body heights. */
 const MIN_DISTANCE = 1.2;
 const MIN_DISTANCE_IN_HEIGHTS = 1.5;
 /** A point of the floor further away than this is not used, in metres and body heights. */
