@@ -53,6 +53,7 @@ export class Headset {
   /** From the point at which the page's camera looks to that camera. */
   private readonly eyeOffset = new THREE.Vector3();
   private readonly pointer = createPointer();
+  private readonly disposal = new AbortController();
 
   constructor(private readonly stage: Stage) {
     this.buttons = MODES.map(({ mode, name, icon, hint }) => {
@@ -63,7 +64,7 @@ export class Headset {
     stage.scene.add(this.pointer.group);
     // After three.js has restored the canvas.
     stage.renderer.xr.addEventListener("sessionend", () => this.end());
-    navigator.xr?.addEventListener("devicechange", () => void this.showButtons());
+    navigator.xr?.addEventListener("devicechange", () => void this.showButtons(), { signal: this.disposal.signal });
     void this.showButtons();
   }
 
@@ -101,6 +102,12 @@ export class Headset {
   /** End the session. */
   async leave(): Promise<void> {
     await this.session?.end();
+  }
+
+  /** End the session and forget the browser's devices, which would keep the stage in memory. */
+  async dispose(): Promise<void> {
+    this.disposal.abort();
+    await this.leave();
   }
 
   /** Place the creature and the pointer for the image that is drawn next. */

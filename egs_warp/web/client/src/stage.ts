@@ -151,7 +151,7 @@ export abstract class Stage {
   async dispose(): Promise<void> {
     const { spark } = this.splatRenderer;
     this.isDisposed = true;
-    await this.headset.leave();
+    await this.headset.dispose();
     this.renderer.setAnimationLoop(null);
     this.controls.dispose();
     while (spark.sorting || spark.sortDirty) await pause(10);
