@@ -256,7 +256,15 @@ export class Headset {
     this.hits = undefined;
     if (this.onFloor !== undefined) this.onFloor(point);
     else if (this.mode === "immersive-ar") this.shift(point.sub(this.stage.standPoint));
-    else this.shift(this.stage.renderer.xr.getCamera().getWorldPosition(new THREE.Vector3()).sub(point));
+    else this.shift(this.headPosition().sub(point));
+  }
+
+  /** Return the middle between the eyes; the camera of three.js for both is behind them. */
+  private headPosition(): THREE.Vector3 {
+    const { cameras } = this.stage.renderer.xr.getCamera();
+    const head = new THREE.Vector3();
+    for (const { matrixWorld } of cameras) head.add(new THREE.Vector3().setFromMatrixPosition(matrixWorld));
+    return head.divideScalar(Math.max(cameras.length, 1));
   }
 
   private startGrab({ frame, inputSource }: XRInputSourceEvent): void {
