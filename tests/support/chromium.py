@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -40,13 +40,23 @@ def started() -> Iterator[Any]:
 
 
 def opened(
-    chromium: Any, address: str, width: int = 480, height: int = 480, *, plays: bool = False
+    chromium: Any,
+    address: str,
+    width: int = 480,
+    height: int = 480,
+    *,
+    plays: bool = False,
+    scripts: Sequence[str] = (),
+    **context: Any,
 ) -> tuple[Any, list[str]]:
     """Open a page and wait until it is loaded; returns the page and the list of the browser's errors and warnings.
 
-    Unless ``plays`` is true, a recorded run is stopped at its first frame.
+    Unless ``plays`` is true, a recorded run is stopped at its first frame. ``scripts`` run before those of the page;
+    ``context`` has further settings of the browser, such as ``color_scheme``.
     """
-    page = chromium.new_page(viewport={"width": width, "height": height})
+    page = chromium.new_page(viewport={"width": width, "height": height}, **context)
+    for script in scripts:
+        page.add_init_script(script)
     if SHOTS is not None:
         _keep_shot(page, Path(SHOTS))
     complaints: list[str] = []

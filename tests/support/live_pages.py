@@ -39,10 +39,10 @@ def living(session: Session, **place: Any) -> Iterator[PageServer]:
 
 
 @contextmanager
-def watched(chromium: Any, session: Session, *size: int) -> Iterator[Any]:
-    """Open the page of a live session, which must not report errors."""
+def watched(chromium: Any, session: Session, *size: int, **settings: Any) -> Iterator[Any]:
+    """Open the page of a live session, which must not report errors; ``settings`` are those of ``opened``."""
     with living(session) as server:
-        page, complaints = opened(chromium, server.address, *size)
+        page, complaints = opened(chromium, server.address, *size, **settings)
         yield page
         assert complaints == []
         page.close()

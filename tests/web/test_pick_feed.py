@@ -15,6 +15,7 @@ from egs_warp.web.pick_session import PickSession
 from tests.support.chromium import opened, wait_until
 from tests.support.clicking import balls
 from tests.support.live_pages import in_browser
+from tests.support.page_design import check_controls
 from tests.support.pages import served
 from tests.support.picking import Commands, picking
 
@@ -209,6 +210,7 @@ def test_a_phone_shows_the_panel_on_demand(chromium: Any, tmp_path: Path):
         assert not page.is_visible(".panel")
         page.click("button.narrow")
         assert page.is_visible("#animate")
+        assert check_controls(page, 390) > 10
         box = page.evaluate("document.querySelector('.dock').getBoundingClientRect().toJSON()")
         assert box["left"] >= 0 and box["right"] <= 390 and box["height"] < 70
         changed(page, lambda: page.click("button[title='Remove this object']"))

@@ -21,6 +21,7 @@ from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.web.player import PLAYER, player_script
 from tests.support.bundles import FRAMES, bundle_bytes
 from tests.support.chromium import NEEDED, wait_until
+from tests.support.page_design import check_controls
 from tests.support.static_site import served_folder
 
 pytestmark = [*NEEDED, pytest.mark.skipif(not PLAYER.is_file(), reason="the player is not built; make web builds it")]
@@ -232,7 +233,7 @@ def test_play_ends_and_loop_does_not(chromium: Any, site: str, folder: Path) -> 
     )
     wait_until(page, "times.filter((time, k) => k > 0 && time < times[k - 1]).length >= 3")
     assert page.evaluate("heard") == ["play", "ended", "play"]
-    page.locator("egs-player button[title=Pause]").click()
+    page.locator("egs-player button[title^=Pause]").click()
     assert page.evaluate("document.querySelector('egs-player').paused")
     assert complaints == []
     page.close()
@@ -246,6 +247,7 @@ def test_slider_keys_and_drag(chromium: Any, site: str, folder: Path) -> None:
     # In the middle of the canvas, above the bar.
     box = page.locator("egs-player").bounding_box()
     x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.4 * box["height"]
+    assert check_controls(page, 640) > 4
     before = page.evaluate("document.querySelector('egs-player').view.camera.position.toArray()")
     page.mouse.move(x, y)
     page.mouse.down()
@@ -283,6 +285,63 @@ def test_two_players_on_one_page_are_independent(chromium: Any, site: str, folde
     assert page.evaluate("[one.paused, two.paused, two.currentTime]") == [False, True, 0]
     page.evaluate("two.currentTime = 1.5")
     assert page.evaluate("[two.currentTime, two.duration]") == [1.5, pytest.approx((FRAMES - 1) / 60)]
+    assert complaints == []
+    page.close()
+
+
+_COUNT_RESOURCES = """() => {
+    window.resources = { Texture: 0, Buffer: 0, Framebuffer: 0, VertexArray: 0, Program: 0, Shader: 0 };
+    const context = WebGL2RenderingContext.prototype;
+    for (const kind of Object.keys(resources)) {
+        const [create, remove] = [context[`create${kind}`], context[`delete${kind}`]];
+        context[`create${kind}`] = function (...values) { resources[kind]++; return create.apply(this, values); };
+        context[`delete${kind}`] = function (one) {
+            if (one) resources[kind]--;
+            return remove.call(this, one);
+        };
+    }
+    window.loops = 0;
+    document.addEventListener("timeupdate", ({ target }) => {
+        if (target.currentTime < target.last) loops++;
+        target.last = target.currentTime;
+    }, { capture: true });
+}"""
+"""Script that counts the objects of WebGL that exist and the loops of all players."""
+
+
+def _memory(page: Any) -> tuple[float, dict[str, int]]:
+    """Return the memory that scripts use, array buffers included, in MB, and the number of objects of WebGL."""
+    # Without a sort, whose buffers would be in transfer between the page and a worker.
+    page.evaluate("for (const player of document.querySelectorAll('egs-player')) player.pause()")
+    wait_until(page, "[...document.querySelectorAll('egs-player')].every(({ view }) => !view.sorting)")
+    session = page.context.new_cdp_session(page)
+    for _ in range(3):
+        session.send("HeapProfiler.collectGarbage")
+        page.wait_for_timeout(50)
+    usage = session.send("Runtime.getHeapUsage")
+    session.detach()
+    return (usage["usedSize"] + usage["backingStorageSize"]) / 1e6, page.evaluate("({ ...resources })")
+
+
+@pytest.mark.slow
+def test_memory_is_flat_over_a_hundred_loops_of_two_players(chromium: Any, site: str, folder: Path) -> None:
+    body = _element('src="a.egs" autoplay loop controls') + _element('src="a.egs" autoplay loop', "two")
+    html = f'{_HEAD}<script type="module" src="player.js"></script>{body}</body></html>'
+    (folder / "loops.html").write_text(html, encoding="utf-8")
+    page = chromium.new_page(viewport={"width": 640, "height": 480})
+    complaints: list[str] = []
+    page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+    page.add_init_script(f"({_COUNT_RESOURCES})()")
+    page.goto(f"{site}/loops.html")
+    _wait_until_ready(page)
+    # The browser compiles scripts at first.
+    wait_until(page, "loops >= 60")
+    before, resources = _memory(page)
+    page.evaluate("loops = 0; one.play(); two.play()")
+    wait_until(page, "loops >= 200", seconds=240)
+    after, resources_after = _memory(page)
+    assert resources_after == resources
+    assert after - before < 1.0, (before, after)
     assert complaints == []
     page.close()
 

@@ -2,7 +2,7 @@
 import { copyFile, readFile, writeFile } from "node:fs/promises";
 import { build } from "esbuild";
 
-const shared = { bundle: true, minify: true, format: "esm", target: "es2022", legalComments: "inline" };
+const shared = { bundle: true, minify: true, format: "esm", target: "es2022", legalComments: "inline", loader: { ".css": "text" } };
 const modules = (name) => `./node_modules/${name}`;
 /** Resolves packages from this folder, also for the sources that are shared with the page. */
 const ownPackages = {

@@ -3,7 +3,8 @@
 import { element } from "./dom";
 import type { FrameSource } from "./frame_source";
 
-const COLOURS = ["#d9dee8", "#ffca61", "#7fd1b8", "#5cadff", "#ff8f73"];
+/** Number of colours of curves in style.css. */
+const COLOURS = 5;
 
 export class Charts {
   readonly panel = element("section", { class: "curves", "aria-label": "Curves of the audit" });
@@ -14,7 +15,8 @@ export class Charts {
     seek: (framePosition: number) => void,
   ) {
     for (const { title, unit } of source.header.facts.curves) {
-      const canvas = element("canvas", { class: "curve" });
+      const hint = `${title}; click to go to that time`;
+      const canvas = element("canvas", { class: "curve", role: "img", "aria-label": hint, title: hint });
       const value = element("output", { class: "value" });
       const row = element(
         "div",
@@ -36,10 +38,12 @@ export class Charts {
     if (this.panel.hidden) return;
     const { frames } = this.source;
     const now = frames[Math.min(Math.round(framePosition), frames.length - 1)];
+    const style = getComputedStyle(this.panel);
     this.rows.forEach(({ canvas, value }, k) => {
       const values = frames.map((frame) => frame.curves[k] ?? 0);
       value.textContent = formatted(now?.curves[k] ?? 0);
-      plot(canvas, values, framePosition / Math.max(frames.length - 1, 1), COLOURS[k % COLOURS.length]!);
+      const colour = style.getPropertyValue(`--curve-${k % COLOURS}`);
+      plot(canvas, values, framePosition / Math.max(frames.length - 1, 1), colour, style.color);
     });
   }
 }
@@ -50,7 +54,7 @@ function formatted(value: number): string {
   return value.toFixed(size < 10 ? 2 : 0).replace(/^-(0\.00)$/, "$1");
 }
 
-function plot(canvas: HTMLCanvasElement, values: number[], fraction: number, colour: string): void {
+function plot(canvas: HTMLCanvasElement, values: number[], fraction: number, colour: string, axis: string): void {
   const ratio = Math.min(window.devicePixelRatio, 2);
   const [width, height] = [canvas.clientWidth * ratio, canvas.clientHeight * ratio];
   if (width === 0) return;
@@ -62,12 +66,14 @@ function plot(canvas: HTMLCanvasElement, values: number[], fraction: number, col
   const high = Math.max(...values, low + 1e-12);
   const x = (k: number): number => (k / Math.max(values.length - 1, 1)) * width;
   const y = (value: number): number => height - 2 * ratio - ((value - low) / (high - low)) * (height - 4 * ratio);
-  context.strokeStyle = "#2c313a";
+  context.strokeStyle = axis;
+  context.globalAlpha = 0.15;
   context.lineWidth = ratio;
   context.beginPath();
   context.moveTo(0, y(0));
   context.lineTo(width, y(0));
   context.stroke();
+  context.globalAlpha = 1;
   const trace = (): void => {
     context.beginPath();
     values.forEach((value, k) => context.lineTo(x(k), y(value)));

@@ -11,6 +11,15 @@ export function element<K extends keyof HTMLElementTagNameMap>(
   return created;
 }
 
+/** Draw two letters in the outline of glasses. */
+function letters(text: string): string {
+  return (
+    '<path d="M5 5.5h14a3 3 0 0 1 3 3v7a3 3 0 0 1-3 3h-4.5L12 16l-2.5 2.5H5a3 3 0 0 1-3-3v-7a3 3 0 0 1 3-3z"/>' +
+    `<text x="12" y="14.2" font-size="8.5" font-weight="700" text-anchor="middle" fill="currentColor" ` +
+    `stroke="none">${text}</text>`
+  );
+}
+
 const ICONS = {
   play: '<path d="M7 4.5v15l12-7.5z" fill="currentColor" stroke="none"/>',
   pause: '<path d="M7 5h3.5v14H7zM13.5 5H17v14h-3.5z" fill="currentColor" stroke="none"/>',
@@ -34,6 +43,8 @@ const ICONS = {
   help:
     '<circle cx="12" cy="12" r="8.5"/>' +
     '<path d="M9.5 9.5a2.5 2.5 0 1 1 3.5 2.3c-.7.3-1 .8-1 1.7M12 16.5v.01" stroke-linecap="round"/>',
+  vr: letters("VR"),
+  ar: letters("AR"),
   plus: '<circle cx="12" cy="12" r="8.5"/><path d="M12 8v8M8 12h8"/>',
   minus: '<circle cx="12" cy="12" r="8.5"/><path d="M8 12h8"/>',
   brush: '<path d="M4 20c4 0 5-1.5 5-4l9-11 2 2-11 9c-2.5 0-3 2-5 4z" stroke-linejoin="round"/>',

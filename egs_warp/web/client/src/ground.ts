@@ -45,6 +45,8 @@ export class Ground {
   readonly shadow: { texture: THREE.Texture; region: THREE.Vector4 };
   /** Sky and floor, drawn as one triangle behind everything else. */
   readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
+  /** Shadow alone, on a floor that is seen through the image. */
+  readonly shadowMesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
   private readonly target: THREE.WebGLRenderTarget;
   private readonly camera: THREE.OrthographicCamera;
   private readonly caster: THREE.Mesh;
@@ -121,10 +123,11 @@ export class Ground {
         eye: { value: new THREE.Vector3() },
         forward: { value: new THREE.Vector3() },
         slope: { value: new THREE.Vector2() },
+        middle: { value: new THREE.Vector2() },
       },
-      vertexShader: `varying vec3 ray; uniform mat3 viewToWorld; uniform vec2 slope;
+      vertexShader: `varying vec3 ray; uniform mat3 viewToWorld; uniform vec2 slope, middle;
         void main() {
-          ray = viewToWorld * vec3(position.xy * slope, -1.0);
+          ray = viewToWorld * vec3((position.xy + middle) * slope, -1.0);
           gl_Position = vec4(position.xy, 1.0, 1.0);
         }`,
       fragmentShader: `
@@ -163,13 +166,34 @@ export class Ground {
     this.mesh.frustumCulled = false;
     this.mesh.renderOrder = -10;
     this.mesh.onBeforeRender = (_renderer, _scene, camera) => {
-      const { viewToWorld, eye, forward, slope } = material.uniforms;
+      const { viewToWorld, eye, forward, slope, middle } = material.uniforms;
       (viewToWorld!.value as THREE.Matrix3).setFromMatrix4(camera.matrixWorld);
       (eye!.value as THREE.Vector3).setFromMatrixPosition(camera.matrixWorld);
       camera.getWorldDirection(forward!.value as THREE.Vector3);
       const projection = camera.projectionMatrix.elements;
       (slope!.value as THREE.Vector2).set(1 / projection[0]!, 1 / projection[5]!);
+      // The image of a headset's eye is not symmetric.
+      (middle!.value as THREE.Vector2).set(projection[8]!, projection[9]!);
     };
+    this.shadowMesh = new THREE.Mesh(
+      new THREE.PlaneGeometry(2 * half, 2 * half),
+      new THREE.ShaderMaterial({
+        uniforms: { shade: material.uniforms.shade!, box: material.uniforms.box! },
+        vertexShader: `varying vec2 at;
+          void main() { at = uv; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
+        fragmentShader: `varying vec2 at; uniform sampler2D shade; uniform vec4 box;
+          ${SHADOW_GLSL}
+          void main() {
+            if (any(lessThan(at, box.xy)) || any(greaterThan(at, box.zw))) discard;
+            gl_FragColor = vec4(0.0, 0.0, 0.0, 1.0 - egsShade(shade, at, ${SOFTNESS}));
+          }`,
+        transparent: true,
+        depthTest: false,
+        depthWrite: false,
+      }),
+    );
+    this.shadowMesh.renderOrder = -10;
+    this.shadowMesh.visible = false;
   }
 
   /** Render the shadow map of the cage at node `positions`, centred at `centreOfMass`. */
@@ -185,17 +209,22 @@ export class Ground {
     this.camera.position.set(centre.x, centre.y, 0);
     this.shadow.region.x = centre.x;
     this.shadow.region.y = centre.y;
+    this.shadowMesh.position.set(centre.x, centre.y, 0);
     const saved = {
       target: renderer.getRenderTarget(),
       colour: renderer.getClearColor(new THREE.Color()),
       alpha: renderer.getClearAlpha(),
+      xr: renderer.xr.enabled,
     };
+    // A headset would replace the camera.
+    renderer.xr.enabled = false;
     renderer.setRenderTarget(this.target);
     renderer.setClearColor(0x000000, 1);
     renderer.clear();
     renderer.render(this.casters, this.camera);
     renderer.setRenderTarget(saved.target);
     renderer.setClearColor(saved.colour, saved.alpha);
+    renderer.xr.enabled = saved.xr;
   }
 
   /** Set the bounding box of the shadow; the shader samples the shadow map only inside it. */

@@ -86,28 +86,41 @@ export class Live {
       (node) => this.pushTool.push(node),
       (x, y) => this.go(x, y),
     );
+    viewer.headset.onFloor = ({ x, y }) => this.go(x, y);
     this.pauseButton = button("pause", "Pause (p)", () => this.togglePause());
     const recording = "Record a take: a run folder, as animate writes one (r)";
     this.recordButton = button("record", recording, () => this.toggleRecording());
     const { limits } = source.header.facts;
     const [minSag, maxSag] = limits?.sag ?? [0.01, 0.1];
     this.sliders = {
-      friction: createSlider("Friction", limits?.friction ?? [0, 2], 0.05, (value) => value.toFixed(2), (friction) =>
-        source.send({ type: "set", friction }),
+      friction: createSlider(
+        "Friction",
+        "Coefficient of friction between body and ground",
+        limits?.friction ?? [0, 2],
+        0.05,
+        (value) => value.toFixed(2),
+        (friction) => source.send({ type: "set", friction }),
       ),
       // Logarithmic scale; stiffer to the right.
       sag: createSlider(
         "Stiffness",
+        "Stiffness relative to the default; the body is built anew where it stands",
         [-Math.log(maxSag), -Math.log(minSag)],
         "any",
         (value) => `${(DEFAULT_SAG * Math.exp(value)).toFixed(1)}\u00d7`,
         (value) => source.send({ type: "set", sag: Math.min(Math.max(Math.exp(-value), minSag), maxSag) }),
       ),
     };
-    const setStrength = (value: number): void => {
-      this.pushTool.strength = value;
-    };
-    const push = createSlider("Push", [0.05, 1], 0.05, (value) => value.toFixed(2), setStrength);
+    const push = createSlider(
+      "Push",
+      "Impulse of a push, in m \u221a(g H)",
+      [0.05, 1],
+      0.05,
+      (value) => value.toFixed(2),
+      (value) => {
+        this.pushTool.strength = value;
+      },
+    );
     push.show(this.pushTool.strength);
     this.stylePanel = new StylePanel(source.header.facts, (style) => source.send({ type: "style", ...style }));
     const sheet = { class: "sheet", "aria-label": "Style, body, ground and pushes", hidden: "" };

@@ -3,6 +3,7 @@
 import { element } from "./dom";
 import { Page } from "./page";
 import { fromAddress, fromElement, fromSocket, type FrameSource } from "./frame_source";
+import "./controls.css";
 import "./style.css";
 
 const LOADING = "Loading\u2026";

@@ -1,12 +1,13 @@
 // The page: layout of viewers and controls, and the animation loop.
 
 import { Charts } from "./charts";
-import { button, element, icon, save } from "./dom";
+import { button, element, save, type Icon } from "./dom";
 import { createKeySheet } from "./key_sheet";
 import { Legend } from "./legend";
 import { VideoRecorder } from "./video_recorder";
 import { Live } from "./live";
 import { Pick } from "./pick";
+import { PlaybackBar } from "./playback_bar";
 import { Player } from "./player";
 import { Preparation } from "./preparation";
 import { LiveSource, type FrameSource } from "./frame_source";
@@ -26,11 +27,11 @@ const LAYERS: { name: LayerToggle; title: string; on: boolean; key: string }[] =
   { name: "path", title: "Centre of mass", on: false, key: "7" },
   { name: "feet", title: "Feet", on: false, key: "8" },
 ];
-const PRESETS: { name: Preset; title: string }[] = [
-  { name: "film", title: "Film" },
-  { name: "front", title: "Front" },
-  { name: "side", title: "Side" },
-  { name: "top", title: "Top" },
+const PRESETS: { name: Preset; title: string; hint: string }[] = [
+  { name: "film", title: "Film", hint: "The camera of the video" },
+  { name: "front", title: "Front", hint: "Look at the front of the body" },
+  { name: "side", title: "Side", hint: "Look at the left side of the body" },
+  { name: "top", title: "Top", hint: "Look from above" },
 ];
 /** Keys of a recorded run; a live session has its own. */
 const HELP: [string[], string][] = [
@@ -57,11 +58,7 @@ export class Page {
   private readonly legend: Legend;
   private readonly keySheet = createKeySheet(HELP);
   private readonly recorder = new VideoRecorder();
-  private readonly playButton: HTMLButtonElement;
-  private readonly slider = element("input", {
-    ...{ type: "range", min: "0", step: "any", class: "line", "aria-label": "Time" },
-  });
-  private readonly clock = element("output", { class: "clock" });
+  private readonly bar: PlaybackBar;
   private readonly checkboxes = new Map<LayerToggle, HTMLInputElement>();
   private lastTime = 0;
   /** Smoothed time between two images during playback, s. */
@@ -89,9 +86,9 @@ export class Page {
     const preparation =
       first instanceof LiveSource && first.header.facts.preparing ? new Preparation(first) : undefined;
     if (first instanceof LiveSource && first.header.facts.picking) {
-      this.pick = new Pick(first, this.viewers[0] as Viewer);
+      this.pick = new Pick(first, this.first);
     } else if (first instanceof LiveSource && preparation === undefined) {
-      this.live = new Live(first, this.viewers[0] as Viewer);
+      this.live = new Live(first, this.first);
     }
     for (const viewer of this.viewers) {
       viewer.controls.addEventListener("change", () => {
@@ -99,10 +96,9 @@ export class Page {
       });
     }
     this.charts = new Charts(first, (framePosition) => this.player.seek(framePosition));
-    this.playButton = button("play", "Play (space)", () => this.player.toggle());
-    this.playButton.classList.add("play");
+    this.bar = new PlaybackBar(this.player, { speeds: SPEEDS, onToggle: () => this.player.toggle(), hasLoop: true });
     this.legend = new Legend(first.header.arrays.has("plan"));
-    const recorded = preparation === undefined ? [this.playbackBar()] : [preparation.element];
+    const recorded = preparation === undefined ? [this.bar.element] : [preparation.element];
     const controls = this.pick?.elements() ?? this.live?.elements() ?? [...recorded, this.keySheet];
     const notes = element("div", { class: "notes" }, this.legend.element, this.charts.panel);
     root.append(this.toolbar(), notes, ...controls);
@@ -119,7 +115,8 @@ export class Page {
     const isStill = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.player.playing = this.live === undefined && this.player.lastFrame > 0 && !isStill;
     this.update();
-    requestAnimationFrame((now) => this.animate(now));
+    // In a headset the images are those of its session.
+    this.first.renderer.setAnimationLoop((now) => this.animate(now));
   }
 
   /** Show or hide a layer in all viewers, as its checkbox does. */
@@ -129,6 +126,11 @@ export class Page {
     for (const viewer of this.viewers) viewer.setLayerVisible(name, on);
     this.legend.show(name, on);
     this.update();
+  }
+
+  /** The viewer that headsets and videos show. */
+  private get first(): Viewer {
+    return this.viewers[0]!;
   }
 
   private isShown(name: LayerToggle, viewer: Viewer): boolean {
@@ -155,11 +157,12 @@ export class Page {
       box.checked = on && this.viewers.some((viewer) => this.isShown(name, viewer));
       box.addEventListener("change", () => this.setLayer(name, box.checked));
       this.checkboxes.set(name, box);
-      layers.append(element("label", {}, box, element("span", {}, title), element("kbd", {}, key)));
+      const hint = `Show or hide this layer (${key})`;
+      layers.append(element("label", { title: hint }, box, element("span", {}, title), element("kbd", {}, key)));
     }
     const views = element("div", { class: "menu", hidden: "" });
-    for (const { name, title } of PRESETS) {
-      const item = element("button", { type: "button", class: "item", id: `view-${name}` }, title);
+    for (const { name, title, hint } of PRESETS) {
+      const item = element("button", { type: "button", class: "item", id: `view-${name}`, title: hint }, title);
       item.addEventListener("click", () => {
         for (const viewer of this.viewers) viewer.preset(name);
       });
@@ -168,15 +171,22 @@ export class Page {
     const follow = element("input", { type: "checkbox", id: "follow" });
     follow.addEventListener("change", () => this.setFollow(follow.checked));
     if (this.pick === undefined) {
-      views.append(element("label", {}, follow, element("span", {}, "Follow the creature")));
+      const hint = "The camera moves along the ground with the body";
+      views.append(element("label", { title: hint }, follow, element("span", {}, "Follow the creature")));
     }
-    const toggle = (opened: HTMLElement, other: HTMLElement) => () => {
-      opened.hidden = !opened.hidden;
-      other.hidden = true;
+    const opener = (icon: Icon, title: string, menu: HTMLElement, other: HTMLElement): HTMLButtonElement => {
+      const created = button(icon, title, () => {
+        menu.hidden = !menu.hidden;
+        other.hidden = true;
+        for (const one of openers) one.setAttribute("aria-expanded", String(one === created && !menu.hidden));
+      });
+      created.setAttribute("aria-expanded", "false");
+      return created;
     };
+    const camera = opener("view", "Camera", views, layers);
+    const openers = [camera, opener("layers", "Layers", layers, views)];
     const what = this.live === undefined ? "Record a video of the whole run" : "Record a video of this view";
     const record = button("record", what, () => this.record(record));
-    const camera = button("view", "Camera", toggle(views, layers));
     if (this.pick !== undefined) {
       const picture = button("camera", "Screenshot", () => void this.screenshot());
       return element("nav", { class: "tools", "aria-label": "View" }, camera, picture, views);
@@ -184,32 +194,17 @@ export class Page {
     return element(
       "nav",
       { class: "tools", "aria-label": "View" },
-      button("layers", "Layers", toggle(layers, views)),
+      openers[1]!,
       camera,
       button("curves", "Curves (c)", () => this.toggleCurves()),
       button("camera", this.live === undefined ? "Screenshot (s)" : "Screenshot", () => void this.screenshot()),
       record,
+      // Two runs side by side have no common place in a room, and a prepared creature gets a page of its own.
+      ...(this.viewers.length > 1 || this.first.source.header.facts.preparing ? [] : this.first.headset.buttons),
       ...(this.live === undefined ? [button("help", "Keys (?)", () => this.toggleKeys())] : []),
       layers,
       views,
     );
-  }
-
-  private playbackBar(): HTMLElement {
-    this.slider.addEventListener("input", () => this.player.seek(Number(this.slider.value)));
-    const speed = element("select", { class: "speed", "aria-label": "Speed", title: "Speed" });
-    for (const value of SPEEDS) speed.append(element("option", { value: String(value) }, `${value}\u00d7`));
-    speed.value = "1";
-    speed.addEventListener("change", () => {
-      this.player.speed = Number(speed.value);
-    });
-    const loop = button("loop", "Loop (l)", () => {
-      this.player.loop = !this.player.loop;
-      loop.setAttribute("aria-pressed", String(this.player.loop));
-    });
-    loop.id = "loop";
-    loop.setAttribute("aria-pressed", "true");
-    return element("footer", { class: "dock" }, this.playButton, this.slider, this.clock, speed, loop);
   }
 
   private toggleKeys(): void {
@@ -231,8 +226,6 @@ export class Page {
   }
 
   private record(recordButton: HTMLButtonElement): void {
-    const [viewer] = this.viewers;
-    if (viewer === undefined) return;
     if (this.recorder.recording) {
       this.recorder.stop();
       this.player.playing = false;
@@ -244,7 +237,7 @@ export class Page {
       this.player.seek(0);
       this.player.loop = false;
     }
-    this.recorder.start(viewer.canvas, (blob, ending) => save(blob, `${this.fileName()}.${ending}`));
+    this.recorder.start(this.first.canvas, (blob, ending) => save(blob, `${this.fileName()}.${ending}`));
     recordButton.classList.add("on");
     if (this.live !== undefined) return;
     this.player.playing = true;
@@ -258,7 +251,7 @@ export class Page {
   }
 
   private fileName(): string {
-    const { title } = (this.viewers[0] as Viewer).source.header.facts;
+    const { title } = this.first.source.header.facts;
     return title.replace(/[^\p{L}\p{N}]+/gu, "-").replace(/^-|-$/g, "") || "run";
   }
 
@@ -283,7 +276,7 @@ export class Page {
     else if (event.key === "ArrowRight") this.player.step(1);
     else if (event.key === "ArrowLeft") this.player.step(-1);
     else if (event.key === "s") void this.screenshot();
-    else if (event.key === "l") document.getElementById("loop")?.click();
+    else if (event.key === "l") this.bar.toggleLoop();
     else if (event.key === "?") this.toggleKeys();
     else if (event.key === "Escape") this.keySheet.hidden = true;
     else return;
@@ -306,15 +299,10 @@ export class Page {
 
   /** Show the current frame in viewers, charts and controls. */
   private update(): void {
-    const { player } = this;
     for (const viewer of this.viewers) viewer.show(this.framePosition);
     this.charts.draw(this.framePosition);
     if (this.live !== undefined) return;
-    this.slider.max = String(player.lastFrame);
-    this.slider.value = String(player.framePosition);
-    this.slider.style.setProperty("--done", `${(100 * player.framePosition) / Math.max(player.lastFrame, 1)}%`);
-    this.clock.textContent = `${player.seconds.toFixed(2)} / ${(player.lastFrame / player.rate).toFixed(2)} s`;
-    this.playButton.innerHTML = icon(player.playing ? "pause" : "play");
+    this.bar.update();
   }
 
   /** True if a slow machine must wait until its splats are sorted. In an outdated order the ground would hide the
@@ -324,17 +312,14 @@ export class Page {
   }
 
   private animate(now: number): void {
-    if (this.isWaitingForSort) {
-      requestAnimationFrame((next) => this.animate(next));
-      return;
-    }
+    const { isPresenting } = this.first.headset;
+    if (this.isWaitingForSort && !isPresenting) return;
     const elapsed = this.lastTime === 0 ? 0 : (now - this.lastTime) / 1000;
     this.lastTime = now;
     if (this.live === undefined) this.player.advance(elapsed);
     else if (this.live.advance(elapsed)) this.update();
-    this.adaptResolution(elapsed);
+    if (!isPresenting) this.adaptResolution(elapsed);
     for (const viewer of this.viewers) viewer.draw();
     this.live?.updateGizmos();
-    requestAnimationFrame((next) => this.animate(next));
   }
 }

@@ -21,7 +21,7 @@ const HELP: [string[], string][] = [
   [["wheel"], "zoom"],
   [["Ctrl Z", "Ctrl Y"], "undo, redo"],
   [["N"], "another object"],
-  [["Tab"], "next object"],
+  [["O"], "next object"],
   [["S"], "save"],
   [["?"], "these keys"],
 ];
@@ -102,7 +102,7 @@ export class Pick {
     else if (key === "n") this.send("add");
     else if (key === "?") this.toggleHelp();
     else if (key === "escape") this.helpSheet.hidden = true;
-    else if (key === "tab" && this.state !== undefined && this.state.objects.length > 1) {
+    else if (key === "o" && this.state !== undefined && this.state.objects.length > 1) {
       this.source.send({ type: "select", index: (this.state.active + 1) % this.state.objects.length });
     } else return false;
     return true;

@@ -10,21 +10,28 @@ export class PickPanel {
   private readonly objects = element("div", { class: "objects" });
   private readonly hints = element("div", { class: "hints" });
   private readonly rows = element("dl", { class: "facts" });
-  private readonly impossible = element("details", {}, element("summary"), element("dl", { class: "facts" }));
+  private readonly impossible = element(
+    "details",
+    {},
+    element("summary", { title: "Motions that this body cannot perform, and why" }),
+    element("dl", { class: "facts" }),
+  );
   private readonly motion = element("select", { class: "motion", "aria-label": "Motion", title: "Motion" });
   private readonly jobs = { animate: element("p", { class: "job" }), live: element("p", { class: "job" }) };
   private readonly actions: HTMLButtonElement[];
 
   constructor(private readonly send: Send) {
-    const action = (id: string, title: string, onClick: () => void): HTMLButtonElement => {
-      const created = element("button", { type: "button", class: "action", id }, title);
+    const action = (id: string, name: string, title: string, onClick: () => void): HTMLButtonElement => {
+      const created = element("button", { type: "button", class: "action", id, title }, name);
       created.addEventListener("click", onClick);
       return created;
     };
     this.motion.append(element("option", { value: "jump" }, "jump"));
     this.actions = [
-      action("animate", "Animate", () => send({ type: "animate", motion: this.motion.value })),
-      action("live", "Live", () => send({ type: "live" })),
+      action("animate", "Animate", "Film the chosen motion", () => {
+        send({ type: "animate", motion: this.motion.value });
+      }),
+      action("live", "Live", "Control this object in the browser", () => send({ type: "live" })),
     ];
     const [animate, live] = this.actions as [HTMLButtonElement, HTMLButtonElement];
     const add = button("object", "Another object (n)", () => send({ type: "add" }));
@@ -51,7 +58,8 @@ export class PickPanel {
   showObjects(state: PickState): void {
     this.objects.replaceChildren(
       ...state.objects.map(({ name, count }, index) => {
-        const chip = element("button", { type: "button", class: "chip" }, element("span", {}, name));
+        const chip = element("button", { type: "button", class: "chip", title: `Select ${name}` });
+        chip.append(element("span", {}, name));
         chip.append(element("small", {}, count === 0 ? "empty" : count.toLocaleString("en")));
         chip.setAttribute("aria-pressed", String(index === state.active));
         chip.addEventListener("click", () => this.send({ type: "select", index }));
@@ -90,7 +98,7 @@ export class PickPanel {
     line.replaceChildren(`${title}: `, running && address === undefined ? `${text}\u2026` : text);
     if (address === undefined) return;
     const name = type === "animate" ? "show the film in 3D" : "open the live page";
-    line.append(" ", element("a", { href: address, target: "_blank", rel: "noreferrer" }, name));
+    line.append(" ", element("a", { href: address, title: name, target: "_blank", rel: "noreferrer" }, name));
   }
 }
 

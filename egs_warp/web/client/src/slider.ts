@@ -7,9 +7,10 @@ export interface Slider {
   show(value: number): void;
 }
 
-/** Create a labelled slider; `onChange` is called when the user releases it. */
+/** Create a labelled slider with the tooltip `hint`; `onChange` is called when the user releases it. */
 export function createSlider(
   title: string,
+  hint: string,
   [min, max]: [number, number],
   step: number | "any",
   format: (value: number) => string,
@@ -33,7 +34,7 @@ export function createSlider(
     input.blur();
   });
   return {
-    element: element("label", { class: "slide" }, element("span", {}, title), value, input),
+    element: element("label", { class: "slide", title: hint }, element("span", {}, title), value, input),
     show: (newValue) => {
       if (isDragging) return;
       input.value = String(newValue);

@@ -59,7 +59,9 @@ void main() {
   if (-clip.w > clip.z || clip.w <= 0.0) return;
   // Outside the image the Jacobian grows without bound: evaluate it at most 15 % of the image size beyond the edge.
   vec2 focal = 0.5 * renderSize * vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
-  vec2 slope = clamp(p.xy / -p.z, -0.65 * renderSize / focal, 0.65 * renderSize / focal);
+  // The image of a headset's eye is not symmetric.
+  vec2 middle = vec2(projectionMatrix[2][0], projectionMatrix[2][1]) * 0.5 * renderSize / focal;
+  vec2 slope = middle + clamp(p.xy / -p.z - middle, -0.65 * renderSize / focal, 0.65 * renderSize / focal);
   vec3 right = vec3(focal.x, 0.0, focal.x * slope.x) / -p.z;
   vec3 up = vec3(0.0, focal.y, focal.y * slope.y) / -p.z;
   right = right * renderToViewBasis;
@@ -140,5 +142,12 @@ export function splatRenderer(
   });
   spark.geometry.dispose();
   spark.geometry = new QuadBatches(splatCount);
+  const setUniforms = spark.onBeforeRender.bind(spark);
+  spark.onBeforeRender = (...parameters) => {
+    setUniforms(...parameters);
+    // Spark measures the whole image of a headset, in which each eye has a part.
+    const { viewport } = parameters[2] as THREE.PerspectiveCamera & { viewport?: THREE.Vector4 };
+    if (viewport !== undefined) (spark.uniforms.renderSize.value as THREE.Vector2).set(viewport.z, viewport.w);
+  };
   return { spark, floorDepth };
 }

@@ -42,24 +42,30 @@ export interface DeformedSplats {
   mark(labels: Uint8Array, active: number): void;
 }
 
+/** Change of the colours as the splats turn in the main light. */
+export interface Relighting {
+  /** Quadratic form of the irradiance, sixteen numbers. */
+  irradiance: number[];
+  /** Normal of each splat at rest as bytes 128 + 127 n. */
+  normals: Uint8Array;
+}
+
 interface SplatOptions {
   embedding?: Embedding;
   shadow?: { texture: THREE.Texture; region: THREE.Vector4 };
   hasMarks?: boolean;
-  /** Quadratic form of the irradiance, sixteen numbers, and the normal of each splat at rest as bytes 128 + 127 n. */
-  irradiance?: number[];
-  normals?: Uint8Array;
+  relighting?: Relighting | undefined;
 }
 
 /** Create splats that are deformed by the maps in `cage`, and placed by their `generator`.
  *
  * Without an `embedding` they are static, and all use the first tetrahedron. A `shadow` darkens the splats near the
- * ground. With `hasMarks`, the colour of a splat depends on the object to which it belongs. With an `irradiance`, the
+ * ground. With `hasMarks`, the colour of a splat depends on the object to which it belongs. With `relighting`, the
  * colour of a splat changes with its normal, which turns with the cage. */
 export function deformedSplats(
   data: SplatData,
   cage: THREE.DataTexture,
-  { embedding, shadow, hasMarks = false, irradiance, normals }: SplatOptions,
+  { embedding, shadow, hasMarks = false, relighting }: SplatOptions,
 ): DeformedSplats {
   const { means, rotations, scales, opacities, colours, degree } = data;
   const count = means.length / 3;
@@ -96,10 +102,10 @@ export function deformedSplats(
     shadeRegion: dyno.dynoVec4(shadow?.region ?? new THREE.Vector4(), "egsShadeRegion"),
     eye: dyno.dynoVec3(eye, "egsEye"),
     place: dyno.dynoMat4(place, "egsPlace"),
-    normals: dyno.dynoSampler2D(normals ? normalTexture(normals) : cage, "egsNormals"),
+    normals: dyno.dynoSampler2D(relighting ? normalTexture(relighting.normals) : cage, "egsNormals"),
     // Zero without a main light.
     irradiance: dyno.dynoMat4(
-      new THREE.Matrix4().fromArray(irradiance ?? new Array<number>(16).fill(0)),
+      new THREE.Matrix4().fromArray(relighting?.irradiance ?? new Array<number>(16).fill(0)),
       "egsIrradiance",
     ),
     degree: dyno.dynoConst("int", degree),

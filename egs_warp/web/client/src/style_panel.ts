@@ -29,7 +29,12 @@ export class StylePanel {
     const [min, max] = limits?.style ?? [0.5, 2];
     const row = element("div", { class: "choice", role: "group", "aria-label": "Style" });
     for (const [name, style] of Object.entries(this.styles)) {
-      const button = element("button", { type: "button", id: `style-${name}`, "aria-pressed": "false" }, name);
+      const hint = FIELDS.map(([field, title]) => `${title} ${style[field].toFixed(2)}\u00d7`).join(", ");
+      const button = element(
+        "button",
+        { type: "button", id: `style-${name}`, "aria-pressed": "false", title: hint },
+        name,
+      );
       button.addEventListener("click", (event) => {
         this.choose(style);
         if (event.detail > 0) button.blur();
@@ -41,8 +46,7 @@ export class StylePanel {
     const sliders = FIELDS.map(([name, title, hint]) => {
       const format = (value: number): string => `${rounded(Math.exp(value)).toFixed(2)}\u00d7`;
       const onSlide = (value: number): void => this.choose({ ...this.style, [name]: rounded(Math.exp(value)) });
-      const slider = createSlider(title, [Math.log(min), Math.log(max)], "any", format, onSlide);
-      slider.element.title = hint;
+      const slider = createSlider(title, hint, [Math.log(min), Math.log(max)], "any", format, onSlide);
       return [name, slider] as const;
     });
     this.sliders = new Map(sliders);

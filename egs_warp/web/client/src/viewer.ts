@@ -1,15 +1,11 @@
 // Viewer of one run on one canvas: splats, overlays, ground and camera.
 
 import * as THREE from "three";
-import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
-import { Cage, identityCage } from "./cage";
-import { splatRenderer, type SplatRenderer } from "./splat_renderer";
-import { fitCamera } from "./fit_camera";
-import { BACKGROUND, FLOOR_DEPTH, Ground } from "./ground";
+import { Bodies, type Body } from "./bodies";
 import { Overlays, type Layer } from "./overlays";
 import { bytesOf, embeddingOf, floatsOf, indicesOf, splatsOf, type Frame } from "./packets";
 import type { FrameSource } from "./frame_source";
-import { deformedSplats, type DeformedSplats } from "./splats";
+import { Stage } from "./stage";
 
 /** Fraction of the picture that the body or its run fills in the views front, side and top. */
 const FILL = 0.86;
@@ -22,91 +18,75 @@ const HALF_VIEW_HEIGHT = 1;
 export type Preset = "film" | "front" | "side" | "top";
 export type LayerToggle = Layer | "splats" | "scene" | "ground";
 
-export class Viewer {
-  readonly renderer: THREE.WebGLRenderer;
-  readonly camera = new THREE.PerspectiveCamera();
-  readonly controls: OrbitControls;
+export class Viewer extends Stage {
   /** True if the camera follows the centre of mass. */
   follow = false;
-  /** Fraction of the canvas resolution along each side; reduced on slow machines. */
-  private resolution = 1;
-  private readonly scene = new THREE.Scene();
-  private readonly splatRenderer: SplatRenderer;
-  private readonly cage: Cage;
-  private readonly splats: DeformedSplats;
-  private readonly background: DeformedSplats | undefined;
+  protected readonly bodies: Bodies;
   private readonly overlays: Overlays;
-  private readonly ground: Ground;
   private readonly masses: Float32Array;
   /** Bounds of the body over the run. */
   private readonly bounds: THREE.Box3;
   /** Middle of the body in the first frame. */
   private readonly startCentre: THREE.Vector3;
-  private readonly positions: Float32Array;
   private readonly currentCentre = new THREE.Vector3();
   /** Height of the ground under the body that the camera follows, m. */
   private groundHeight = 0;
-  private filmFov = 30;
-  private dirty = true;
+  /** True for the ground and the scene if their layers are on. */
+  private readonly layers = { ground: true, scene: true };
 
   constructor(
-    readonly canvas: HTMLCanvasElement,
+    canvas: HTMLCanvasElement,
     readonly source: FrameSource,
   ) {
     const { header } = source;
-    // Spark advises against multisampling, which does not improve splats.
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
-    this.renderer.setClearColor(BACKGROUND, 1);
-    this.camera.up.set(0, 0, 1);
-    this.masses = floatsOf(header, "node_mass");
+    const { antialiased, height, light } = header.facts;
+    const surface = indicesOf(header, "surface");
     const rest = floatsOf(header, "rest");
-    this.positions = new Float32Array(rest);
-    this.cage = new Cage(rest, indicesOf(header, "tets"));
-    this.splats = deformedSplats(splatsOf(header, "splats"), this.cage.texture, {
-      embedding: embeddingOf(header),
-      hasMarks: header.facts.picking ?? false,
-      ...(header.facts.light && {
-        irradiance: header.facts.light.irradiance,
-        normals: bytesOf(header, "splats_normals"),
-      }),
-    });
-    this.splatRenderer = splatRenderer(this.renderer, header.facts.antialiased, () => this.invalidate());
-    this.scene.add(this.splatRenderer.spark, this.splats.generator);
+    super(canvas, { antialiased, height, surface, nodeCount: rest.length / 3, light });
+    this.masses = floatsOf(header, "node_mass");
+    const positionsAt = (frame: number): Float32Array => source.frames[frame]!.positions;
+    const track = { rest, tets: indicesOf(header, "tets"), embedding: embeddingOf(header), positionsAt };
+    const relighting = light && { irradiance: light.irradiance, normals: bytesOf(header, "splats_normals") };
+    const bodies: Body[] = [{ splats: splatsOf(header, "splats"), track, relighting }];
+    if (header.arrays.has("scene_means")) bodies.push({ splats: splatsOf(header, "scene") });
+    this.bodies = new Bodies(bodies, { shadow: this.ground.shadow, hasMarks: header.facts.picking ?? false });
     this.overlays = new Overlays(header, (frame) => this.computeCentre(frame.positions));
-    this.scene.add(this.overlays.group);
+    this.scene.add(this.bodies.object, this.overlays.group);
     this.bounds = this.runBounds();
     const [start] = source.frames as [Frame];
     this.startCentre = new THREE.Box3().setFromArray(start.positions).getCenter(new THREE.Vector3());
-    this.ground = new Ground(indicesOf(header, "surface"), rest.length / 3, header.facts.height, header.facts.light);
-    if (header.arrays.has("scene_means")) {
-      const { shadow } = this.ground;
-      this.background = deformedSplats(splatsOf(header, "scene"), identityCage(), { shadow });
-      this.scene.add(this.background.generator);
-    }
-    this.ground.mesh.visible = this.background === undefined;
-    this.scene.add(this.ground.mesh);
-    this.controls = new OrbitControls(this.camera, canvas);
-    this.controls.enableDamping = true;
-    this.controls.dampingFactor = 0.12;
+    this.layers.ground = !this.hasScene;
+    this.showSurroundings();
     this.controls.zoomToCursor = true;
-    this.controls.addEventListener("change", () => this.invalidate());
     this.preset("film");
     this.show(0);
   }
 
   get hasScene(): boolean {
-    return this.background !== undefined;
+    return this.bodies.hasStill;
   }
 
-  invalidate(): void {
-    this.dirty = true;
+  get standPoint(): THREE.Vector3 {
+    return this.centreOfMass.setZ(0);
+  }
+
+  protected get hasOpaqueFloor(): boolean {
+    const { layers, mode } = this;
+    const isFloorShown = mode === "immersive-ar" || (layers.ground && !(this.hasScene && layers.scene));
+    return this.source.header.facts.flat && isFloorShown;
+  }
+
+  protected showSurroundings(): void {
+    const isInRoom = this.mode === "immersive-ar";
+    this.ground.mesh.visible = this.layers.ground && !isInRoom;
+    this.bodies.showStill(this.layers.scene && !isInRoom);
   }
 
   setLayerVisible(layer: LayerToggle, visible: boolean): void {
-    if (layer === "splats") this.splats.generator.visible = visible;
-    else if (layer === "ground") this.ground.mesh.visible = visible;
-    else if (layer === "scene") {
-      if (this.background !== undefined) this.background.generator.visible = visible;
+    if (layer === "splats") this.bodies.showMoving(visible);
+    else if (layer === "ground" || layer === "scene") {
+      this.layers[layer] = visible;
+      this.showSurroundings();
     } else this.overlays.show(layer, visible);
     this.invalidate();
   }
@@ -115,20 +95,17 @@ export class Viewer {
   show(framePosition: number): void {
     const { frames } = this.source;
     const at = Math.min(framePosition, frames.length - 1);
-    const before = frames[Math.floor(at)] as Frame;
-    const after = frames[Math.min(Math.floor(at) + 1, frames.length - 1)] as Frame;
-    const fraction = at - Math.floor(at);
-    for (let k = 0; k < this.positions.length; k++) {
-      this.positions[k] = before.positions[k]! + fraction * (after.positions[k]! - before.positions[k]!);
-    }
-    this.cage.update(this.positions);
-    this.splats.update();
-    this.overlays.update(fraction < 0.5 ? before : after, this.positions, frames);
+    this.bodies.interpolate(at, frames.length);
+    this.overlays.update(frames[Math.round(at)] as Frame, this.positions, frames);
     const centre = this.computeCentre(this.positions);
-    if (this.follow) this.followBody(centre, before);
+    if (this.follow) this.followBody(centre, frames[Math.floor(at)] as Frame);
     this.currentCentre.copy(centre);
     this.ground.cast(this.renderer, this.positions, centre);
     this.invalidate();
+  }
+
+  private get positions(): Float32Array {
+    return this.bodies.positions;
   }
 
   /** Move with the body along the ground, and up or down only with the ground that carries it: the camera does not
@@ -150,7 +127,7 @@ export class Viewer {
 
   preset(name: Preset): void {
     const { camera, height } = this.source.header.facts;
-    this.filmFov = camera.fov;
+    this.fov = camera.fov;
     // Where the camera follows, it shows the body; elsewhere, its whole run.
     const isFollowing = this.follow || this.source.isOpen;
     const box = isFollowing ? new THREE.Box3().setFromArray(this.positions) : this.bounds;
@@ -226,64 +203,6 @@ export class Viewer {
     this.invalidate();
   }
 
-  resize(): void {
-    const { clientWidth: width, clientHeight: height } = this.canvas;
-    if (width === 0 || height === 0) return;
-    this.renderer.setPixelRatio(this.resolution * Math.min(window.devicePixelRatio, 2));
-    this.renderer.setSize(width, height, false);
-    fitCamera(this.camera, this.filmFov, width / height, this.source.header.facts.height);
-    this.invalidate();
-  }
-
-  /** Reduce the resolution by a quarter, to no less than one half. */
-  reduceResolution(): void {
-    this.setResolution(Math.max(this.resolution - 0.25, 0.5));
-  }
-
-  /** Set the fraction of the canvas resolution along each side. */
-  setResolution(fraction: number): void {
-    if (fraction === this.resolution) return;
-    this.resolution = fraction;
-    this.resize();
-  }
-
-  /** True while the splats of the last image are being sorted. */
-  get sorting(): boolean {
-    return this.splatRenderer.spark.sorting;
-  }
-
-  /** Draw if something has changed; return true if an image was drawn. */
-  draw(): boolean {
-    this.controls.update();
-    if (!this.dirty) return false;
-    this.render();
-    // This image contains the regenerated splats; Spark calls invalidate() again once they are sorted.
-    this.dirty = false;
-    return true;
-  }
-
-  /** Draw after the splats are sorted for the current view. */
-  async drawSorted(): Promise<void> {
-    const { spark } = this.splatRenderer;
-    for (let round = 0; round < 2; round++) {
-      this.camera.updateMatrixWorld();
-      this.splats.update();
-      this.render();
-      await spark.update({ scene: this.scene, camera: this.camera });
-      while (spark.sorting) await new Promise((resolve) => setTimeout(resolve, 5));
-    }
-    this.dirty = false;
-    this.render();
-  }
-
-  private render(): void {
-    const { facts } = this.source.header;
-    const isOverFloor = facts.flat && this.ground.mesh.visible && this.camera.position.z > 0;
-    const hasSceneInView = this.background?.generator.visible ?? false;
-    this.splatRenderer.floorDepth.value = isOverFloor && !hasSceneInView ? FLOOR_DEPTH * facts.height : 0;
-    this.renderer.render(this.scene, this.camera);
-  }
-
   /** Return a PNG image of the current view. */
   screenshot(): Promise<Blob> {
     // The canvas keeps its content only until the browser has presented it.
@@ -299,7 +218,7 @@ export class Viewer {
 
   /** Light up the splats of the object `active`; `labels` has the number of the object of each splat, 0 for none. */
   mark(labels: Uint8Array, active: number): void {
-    this.splats.mark(labels, active);
+    this.bodies.mark(labels, active);
     this.invalidate();
   }
 

@@ -2,56 +2,33 @@
 
 import { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
-import { Cage, identityCage } from "../../client/src/cage";
+import { Bodies, type Shadow } from "../../client/src/bodies";
 import { splatRenderer } from "../../client/src/splat_renderer";
-import { deformedSplats, type DeformedSplats } from "../../client/src/splats";
 import { loadBundle, type Bundle, type BundleCage, type Facts } from "./bundle";
-
-interface MovingBody {
-  source: BundleCage;
-  cage: Cage;
-  splats: DeformedSplats;
-  /** Part of `positions` with the nodes of this body. */
-  positions: Float32Array;
-}
-
-/** Shadow that darkens static splats near the ground. */
-export interface Shadow {
-  texture: THREE.Texture;
-  region: THREE.Vector4;
-}
 
 export class Creature {
   /** Metres, with `up` upwards; move, rotate or scale it as any other object. */
-  readonly object = new THREE.Group();
-  /** Positions of the nodes of all cages in the frame that is shown, in the axes of the bundle. */
-  readonly positions: Float32Array;
-  private readonly bodies: MovingBody[] = [];
+  readonly object: THREE.Group;
+  readonly bodies: Bodies;
 
   constructor(
     readonly bundle: Bundle,
     { up = THREE.Object3D.DEFAULT_UP, shadow }: { up?: THREE.Vector3; shadow?: Shadow } = {},
   ) {
     const { facts } = bundle;
+    const trackOf = (cage: BundleCage) => ({ ...cage, positionsAt: (frame: number) => cage.frames[frame]! });
+    const bodies = bundle.bodies.map(({ splats, cage }) => ({ splats, track: cage && trackOf(cage) }));
+    this.bodies = new Bodies(bodies, { shadow });
+    this.object = this.bodies.object;
     this.object.name = facts.title ?? "creature";
     this.object.quaternion.setFromUnitVectors(new THREE.Vector3(...facts.up), up);
     this.object.scale.setScalar(facts.metres_per_unit);
-    const cages = bundle.bodies.flatMap(({ cage }) => cage ?? []);
-    this.positions = new Float32Array(cages.reduce((sum, { rest }) => sum + rest.length, 0));
-    let start = 0;
-    for (const { splats: data, cage: source } of bundle.bodies) {
-      if (source === undefined) {
-        this.object.add(deformedSplats(data, identityCage(), { ...(shadow && { shadow }) }).generator);
-        continue;
-      }
-      const cage = new Cage(source.rest, source.tets);
-      const splats = deformedSplats(data, cage.texture, { embedding: source.embedding });
-      const positions = this.positions.subarray(start, start + source.rest.length);
-      start += positions.length;
-      this.bodies.push({ source, cage, splats, positions });
-      this.object.add(splats.generator);
-    }
     this.show(0);
+  }
+
+  /** Positions of the nodes of all cages in the frame that is shown, in the axes of the bundle. */
+  get positions(): Float32Array {
+    return this.bodies.positions;
   }
 
   get facts(): Facts {
@@ -70,15 +47,7 @@ export class Creature {
 
   /** Show the state at a fractional frame index; positions are interpolated linearly. */
   show(framePosition: number): void {
-    const at = Math.min(Math.max(framePosition, 0), this.bundle.available - 1);
-    const fraction = at - Math.floor(at);
-    for (const { source, cage, splats, positions } of this.bodies) {
-      const before = source.frames[Math.floor(at)]!;
-      const after = source.frames[Math.ceil(at)]!;
-      for (let k = 0; k < positions.length; k++) positions[k] = before[k]! + fraction * (after[k]! - before[k]!);
-      cage.update(positions);
-      splats.update();
-    }
+    this.bodies.interpolate(framePosition, this.bundle.available);
   }
 }
 

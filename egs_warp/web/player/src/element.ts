@@ -1,9 +1,10 @@
 // The custom element <egs-player>.
 
-import { button, element, icon } from "../../client/src/dom";
+import { button, element } from "../../client/src/dom";
+import { PlaybackBar } from "../../client/src/playback_bar";
 import { Player } from "../../client/src/player";
 import { loadBundle, type Bundle } from "./bundle";
-import { Stage } from "./stage";
+import { BundleStage } from "./stage";
 import { STYLE } from "./style";
 
 const SPEEDS = [0.25, 0.5, 1, 2];
@@ -22,15 +23,11 @@ export class EgsPlayer extends HTMLElement {
   private readonly image = element("img", { alt: "", hidden: "" });
   private readonly message = element("p", { class: "message", role: "alert", hidden: "" });
   private readonly startButton = button("play", "Play", () => this.play());
-  private readonly playButton = button("play", "Play", () => this.toggle());
-  private readonly slider = element("input", { type: "range", min: "0", step: "any", class: "line" });
-  private readonly clock = element("output", { class: "clock" });
-  private readonly speedChoice = element("select", { "aria-label": "Speed", title: "Speed" });
-  private readonly bar: HTMLElement;
+  private readonly bar: PlaybackBar;
   private readonly sizes = new ResizeObserver(() => this.stage?.resize());
   private readonly sight = new IntersectionObserver((entries) => this.seen(entries), { rootMargin: LOAD_MARGIN });
   private bundle: Bundle | undefined;
-  private stage: Stage | undefined;
+  private stage: BundleStage | undefined;
   private readonly player: Player;
   /** True once the splats of the first frame have been drawn in order. */
   private isDrawn = false;
@@ -39,7 +36,6 @@ export class EgsPlayer extends HTMLElement {
   /** Number of the load in progress; a later one replaces it. */
   private loads = 0;
   private isLoading = false;
-  private request = 0;
   private lastTime = 0;
   private frameTime = 0;
 
@@ -60,25 +56,19 @@ export class EgsPlayer extends HTMLElement {
       () => this.update(),
     );
     this.player.loop = false;
-    this.slider.setAttribute("aria-label", "Time");
-    this.slider.addEventListener("input", () => {
-      this.player.seek(Number(this.slider.value));
-      this.dispatchEvent(new Event("seeked"));
+    this.bar = new PlaybackBar(this.player, {
+      speeds: SPEEDS,
+      onToggle: () => this.toggle(),
+      onSeek: () => this.dispatchEvent(new Event("seeked")),
     });
-    for (const value of SPEEDS) this.speedChoice.append(new Option(`${value}\u00d7`, String(value)));
-    this.speedChoice.addEventListener("change", () => {
-      this.playbackRate = Number(this.speedChoice.value);
-    });
+    this.bar.element.hidden = true;
     this.startButton.classList.add("start");
-    this.bar = element("div", { class: "bar", hidden: "" });
-    this.bar.append(this.playButton, this.slider, this.clock, this.speedChoice);
     this.frame.addEventListener("pointerdown", () => this.stage?.canvas.focus());
     this.frame.addEventListener("focusin", () => this.allowZoom(true));
     this.frame.addEventListener("focusout", () => this.allowZoom(false));
     this.frame.addEventListener("keydown", (event) => this.keyDown(event));
-    this.playbackRate = 1;
     const root = this.attachShadow({ mode: "open" });
-    root.append(element("style", {}, STYLE), this.frame, this.image, this.startButton, this.bar, this.message);
+    root.append(element("style", {}, STYLE), this.frame, this.image, this.startButton, this.bar.element, this.message);
   }
 
   connectedCallback(): void {
@@ -133,10 +123,7 @@ export class EgsPlayer extends HTMLElement {
   set playbackRate(speed: number) {
     if (!(speed > 0)) return;
     this.player.speed = speed;
-    if (![...this.speedChoice.options].some((option) => option.value === String(speed))) {
-      this.speedChoice.append(new Option(`${speed}\u00d7`, String(speed)));
-    }
-    this.speedChoice.value = String(speed);
+    this.bar.update();
   }
 
   /** As of a video: 0 for nothing, 1 when the duration is known, 3 when it can play, 4 when all of it has arrived. */
@@ -152,7 +139,7 @@ export class EgsPlayer extends HTMLElement {
   }
 
   /** Scene, camera and renderer; undefined before the first frames have arrived. */
-  get view(): Stage | undefined {
+  get view(): BundleStage | undefined {
     return this.stage;
   }
 
@@ -209,9 +196,10 @@ export class EgsPlayer extends HTMLElement {
       throw new Error("This browser has no WebGL2, which is needed to draw the splats.");
     }
     this.bundle = bundle;
-    const stage = new Stage(bundle);
+    const stage = new BundleStage(bundle);
     this.stage = stage;
     this.frame.replaceChildren(stage.canvas);
+    this.bar.element.append(...stage.headset.buttons);
     stage.setBackground(this.getAttribute("background") ?? "");
     this.allowZoom(false);
     stage.resize();
@@ -224,13 +212,14 @@ export class EgsPlayer extends HTMLElement {
     if (this.hasAttribute("autoplay") && !isStill) this.play();
     this.update();
     this.dispatchEvent(new Event("canplay"));
-    this.request = requestAnimationFrame((now) => this.tick(now));
+    // In a headset the images are those of its session.
+    stage.renderer.setAnimationLoop((now) => this.tick(now));
   }
 
   private unload(): void {
     this.loads++;
     this.isLoading = false;
-    cancelAnimationFrame(this.request);
+    for (const one of this.stage?.headset.buttons ?? []) one.remove();
     void this.stage?.dispose();
     this.frame.replaceChildren();
     this.stage = undefined;
@@ -261,27 +250,20 @@ export class EgsPlayer extends HTMLElement {
   private update(): void {
     const { player } = this;
     this.stage?.show(player.framePosition);
-    const hasControls = this.hasAttribute("controls");
-    this.bar.hidden = !hasControls || this.stage === undefined;
+    this.bar.element.hidden = !this.hasAttribute("controls") || this.stage === undefined;
     // Without a bar, a player that does not start by itself shows one large button.
-    this.startButton.hidden = player.playing || this.hasAttribute("autoplay") || (hasControls && !this.bar.hidden);
-    this.slider.max = String(player.lastFrame);
-    this.slider.value = String(player.framePosition);
-    this.slider.style.setProperty("--done", `${(100 * player.framePosition) / Math.max(player.lastFrame, 1)}%`);
-    this.clock.textContent = `${player.seconds.toFixed(2)} / ${(player.lastFrame / player.rate).toFixed(2)} s`;
-    const action = player.playing ? "Pause" : "Play";
-    this.playButton.innerHTML = icon(player.playing ? "pause" : "play");
-    this.playButton.title = action;
-    this.playButton.setAttribute("aria-label", action);
+    this.startButton.hidden = player.playing || this.hasAttribute("autoplay") || !this.bar.element.hidden;
+    this.bar.update();
     if (this.stage !== undefined) this.dispatchEvent(new Event("timeupdate"));
   }
 
   private tick(now: number): void {
-    this.request = requestAnimationFrame((next) => this.tick(next));
     const { stage, player } = this;
-    if (stage === undefined || !this.isVisible) return;
+    if (stage === undefined) return;
+    const { isPresenting } = stage.headset;
+    if (!this.isVisible && !isPresenting) return;
     // In an outdated order, the ground would hide the body.
-    if (player.playing && this.frameTime > SLOW_FRAME_TIME && stage.sorting) return;
+    if (!isPresenting && player.playing && this.frameTime > SLOW_FRAME_TIME && stage.sorting) return;
     const elapsed = this.lastTime === 0 ? 0 : (now - this.lastTime) / 1000;
     this.lastTime = now;
     this.frameTime += 0.05 * (Math.min(elapsed, 0.2) - this.frameTime);

@@ -1,0 +1,165 @@
+// Picture of splats on their ground, on one canvas: renderer, camera, and when an image is drawn.
+
+import * as THREE from "three";
+import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import type { Bodies } from "./bodies";
+import { fitCamera } from "./fit_camera";
+import { BACKGROUND, FLOOR_DEPTH, Ground } from "./ground";
+import { Headset } from "./headset";
+import type { MainLight } from "./packets";
+import { splatRenderer, type SplatRenderer } from "./splat_renderer";
+
+export interface StageOptions {
+  /** True if the capture was trained with antialiasing. */
+  antialiased: boolean;
+  /** Height of the body, m. */
+  height: number;
+  /** Triangles of the surface that casts the shadow, and the number of its nodes. */
+  surface: Int32Array;
+  nodeCount: number;
+  /** Main light of the capture; undefined where it is not clear. */
+  light?: MainLight | undefined;
+}
+
+function pause(milliseconds: number): Promise<void> {
+  return new Promise((resolve) => setTimeout(resolve, milliseconds));
+}
+
+export abstract class Stage {
+  readonly renderer: THREE.WebGLRenderer;
+  readonly scene = new THREE.Scene();
+  readonly camera = new THREE.PerspectiveCamera();
+  readonly controls: OrbitControls;
+  readonly ground: Ground;
+  readonly headset: Headset;
+  /** Height of the body, m. */
+  readonly height: number;
+  /** Vertical field of view of the film, degrees. */
+  protected fov = 30;
+  /** Kind of the session of a headset; undefined on the page. */
+  protected mode: XRSessionMode | undefined;
+  private readonly splatRenderer: SplatRenderer;
+  /** Fraction of the canvas resolution along each side; reduced on slow machines. */
+  private resolution = 1;
+  private dirty = true;
+  private isDisposed = false;
+
+  constructor(
+    readonly canvas: HTMLCanvasElement,
+    { antialiased, height, surface, nodeCount, light }: StageOptions,
+  ) {
+    this.height = height;
+    // Spark advises against multisampling, which does not improve splats.
+    const context = { canvas, antialias: false, alpha: true };
+    this.renderer = new THREE.WebGLRenderer({ ...context, powerPreference: "high-performance" });
+    this.renderer.setClearColor(BACKGROUND, 1);
+    this.camera.up.set(0, 0, 1);
+    this.ground = new Ground(surface, nodeCount, height, light);
+    this.splatRenderer = splatRenderer(this.renderer, antialiased, () => this.invalidate());
+    this.scene.add(this.splatRenderer.spark, this.ground.mesh, this.ground.shadowMesh);
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.enableDamping = true;
+    this.controls.dampingFactor = 0.12;
+    this.controls.addEventListener("change", () => this.invalidate());
+    this.headset = new Headset(this);
+  }
+
+  protected abstract readonly bodies: Bodies;
+
+  /** Point of the ground under the middle of the body, in the axes of the scene. */
+  abstract get standPoint(): THREE.Vector3;
+
+  /** True if a floor at z = 0 hides what is below it. */
+  protected abstract get hasOpaqueFloor(): boolean;
+
+  /** Show the surroundings for `mode`. In augmented reality there is only the shadow on the real floor. */
+  protected abstract showSurroundings(): void;
+
+  /** Change to the surroundings of a headset, or back to those of the page. */
+  setMode(mode: XRSessionMode | undefined): void {
+    this.mode = mode;
+    this.ground.shadowMesh.visible = mode === "immersive-ar";
+    this.showSurroundings();
+    this.resize();
+    this.invalidate();
+  }
+
+  invalidate(): void {
+    this.dirty = true;
+  }
+
+  resize(): void {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    // A headset has a size and a projection of its own.
+    if (width === 0 || height === 0 || this.headset.isPresenting) return;
+    this.renderer.setPixelRatio(this.resolution * Math.min(window.devicePixelRatio, 2));
+    this.renderer.setSize(width, height, false);
+    fitCamera(this.camera, this.fov, width / height, this.height);
+    this.invalidate();
+  }
+
+  /** Reduce the resolution by a quarter, to no less than one half. */
+  reduceResolution(): void {
+    this.setResolution(Math.max(this.resolution - 0.25, 0.5));
+  }
+
+  /** Set the fraction of the canvas resolution along each side. */
+  setResolution(fraction: number): void {
+    if (fraction === this.resolution) return;
+    this.resolution = fraction;
+    this.resize();
+  }
+
+  /** True while the splats of the last image are being sorted. */
+  get sorting(): boolean {
+    return this.splatRenderer.spark.sorting;
+  }
+
+  /** Draw if something has changed; return true if an image was drawn. */
+  draw(): boolean {
+    if (this.headset.isPresenting) this.headset.update();
+    else {
+      this.controls.update();
+      if (!this.dirty) return false;
+    }
+    this.render();
+    // This image contains the regenerated splats; Spark calls invalidate() again once they are sorted.
+    this.dirty = false;
+    return true;
+  }
+
+  /** Draw after the splats are sorted for the current view. */
+  async drawSorted(): Promise<void> {
+    const { spark } = this.splatRenderer;
+    for (let round = 0; round < 2 && !this.isDisposed; round++) {
+      this.camera.updateMatrixWorld();
+      // Colours depend on the direction from the camera.
+      this.bodies.update();
+      this.render();
+      await spark.update({ scene: this.scene, camera: this.camera });
+      while (spark.sorting) await pause(5);
+    }
+    if (this.isDisposed) return;
+    this.render();
+    this.dirty = false;
+  }
+
+  protected render(): void {
+    const isAbove = this.headset.isPresenting || this.camera.position.z > 0;
+    this.splatRenderer.floorDepth.value = this.hasOpaqueFloor && isAbove ? FLOOR_DEPTH * this.height : 0;
+    this.renderer.render(this.scene, this.camera);
+  }
+
+  /** Release the WebGL context, after the sort in progress: Spark cannot read from a lost context. */
+  async dispose(): Promise<void> {
+    const { spark } = this.splatRenderer;
+    this.isDisposed = true;
+    await this.headset.dispose();
+    this.renderer.setAnimationLoop(null);
+    this.controls.dispose();
+    while (spark.sorting || spark.sortDirty) await pause(10);
+    spark.dispose();
+    this.renderer.dispose();
+    this.renderer.forceContextLoss();
+  }
+}
