@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from egs_warp.kernels.contact.islands import islands_kernel
-from egs_warp.launching import launch_cached
+from egs_warp.launching import device_of, launch_cached
 
 
 def enqueue_islands(counts: wp.array, pairs: wp.array, islands: wp.array) -> None:
@@ -17,7 +17,7 @@ def enqueue_islands(counts: wp.array, pairs: wp.array, islands: wp.array) -> Non
         pairs: (B, K) vec2i, bodies of each contact; a negative one is an obstacle.
         islands: (B, nbody) int, overwritten with the lowest body of each body's island.
     """
-    launch_cached(islands_kernel, len(islands), inputs=[counts, pairs], outputs=[islands], device=islands.device)
+    launch_cached(islands_kernel, len(islands), inputs=[counts, pairs], outputs=[islands], device=device_of(islands))
 
 
 def find_islands(body_count: int, pairs: np.ndarray) -> np.ndarray:

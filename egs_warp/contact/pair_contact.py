@@ -18,7 +18,7 @@ import warp as wp
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.kernels.contact import pair_contact as kernels
-from egs_warp.launching import copy_into, launch_cached, zeros
+from egs_warp.launching import copy_into, empty, launch_cached, zeros
 from egs_warp.meshing.level_set import LevelSet
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 from egs_warp.short_repr import short_repr
@@ -72,9 +72,8 @@ class PairContactSet:
         entries = self.axes[:, :, None, None, :] * signed[:, None, :, :, None]
         columns = np.broadcast_to(3 * self.nodes[:, None, :, :, None] + np.arange(3), entries.shape)
         rows = np.repeat(np.arange(3 * self.count), 24)
-        return sparse.coo_matrix(
-            (entries.ravel(), (rows, columns.ravel())), (3 * self.count, 3 * self.node_count)
-        ).tocsr()
+        shape = 3 * self.count, 3 * self.node_count
+        return sparse.csr_matrix((entries.ravel(), (rows, columns.ravel())), shape)
 
 
 class PairContactDetector:
@@ -197,9 +196,9 @@ class _DeformedBody:
         ]
         self.positions = wp.array(mesh.nodes[None], dtype=Vec3, device=device)
         self._tets = wp.array(mesh.tets, dtype=wp.vec4i, device=device)
-        self._boxes = [wp.empty(len(mesh.tets), dtype=wp.vec3, device=device) for _ in range(2)]
+        self._lowers, self._uppers = (empty(len(mesh.tets), wp.vec3, device) for _ in range(2))
         self._compute_boxes()
-        self._hierarchy = wp.Bvh(*self._boxes, groups=zeros(len(mesh.tets), int, device))
+        self._hierarchy = wp.Bvh(self._lowers, self._uppers, groups=zeros(len(mesh.tets), int, device))
         rest = wp.array(mesh.nodes[None], dtype=Vec3, device=device)
         level_set = body.level_set
         self.shape = [self._tets, rest, self._hierarchy.id, level_set.lattice, level_set.on_device(device)]
@@ -224,6 +223,6 @@ class _DeformedBody:
             kernels.tet_boxes_kernel,
             (1, len(self._tets)),
             inputs=inputs,
-            outputs=self._boxes,
+            outputs=[self._lowers, self._uppers],
             device=self.device,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,7 +16,7 @@ from scipy.spatial import Delaunay
 from egs_warp.errors import UserError
 from egs_warp.kernels.contact.level_set import LevelSetLattice, level_set_kernel
 from egs_warp.kernels.meshing.surface_distance import surface_distance_kernel
-from egs_warp.launching import Device, launch_rows
+from egs_warp.launching import Device, empty, launch_rows
 from egs_warp.meshing.occupancy import LatticeSolid
 from egs_warp.precision import Vec3, real
 from egs_warp.short_repr import short_repr
@@ -76,9 +77,9 @@ class LevelSet:
         return cls(np.asarray(origin, float), float(spacing), np.asarray(coefficients, np.float32))
 
     @cached_property
-    def lattice(self) -> LevelSetLattice:
-        """Lattice as the kernels read it."""
-        lattice = LevelSetLattice()
+    def lattice(self) -> Any:
+        """Lattice as the kernels read it (``LevelSetLattice``)."""
+        lattice: Any = LevelSetLattice()
         lattice.counts = wp.vec3i(*self.coefficients.shape)
         lattice.origin = Vec3(*self.origin.tolist())
         lattice.spacing = self.spacing
@@ -91,8 +92,8 @@ class LevelSet:
     def evaluate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the values (P,) m and gradients (P, 3) at ``points`` (P, 3) m, computed on the CPU."""
         device, points = wp.get_device("cpu"), np.ascontiguousarray(points, np.float64)
-        values = wp.empty(len(points), dtype=real, device=device)
-        gradients = wp.empty(len(points), dtype=Vec3, device=device)
+        values = empty(len(points), real, device)
+        gradients = empty(len(points), Vec3, device)
         launch_rows(
             level_set_kernel,
             len(points),
@@ -143,9 +144,11 @@ def level_set_of_body(solid: LatticeSolid, points: np.ndarray) -> LevelSet:
     """
     from skimage import measure
 
-    inside = np.pad(solid.inside, _MARGIN)
+    inside: np.ndarray = np.pad(solid.inside, _MARGIN)
     origin, spacing = solid.spacing * (solid.corner - _MARGIN), solid.spacing
-    outside_distance, depth = (np.asarray(ndimage.distance_transform_edt(each)) for each in (~inside, inside))
+    outside_distance, depth = (
+        np.asarray(ndimage.distance_transform_edt(each)) for each in (np.logical_not(inside), inside)
+    )
     sharp = outside_distance - depth
     sharp -= 0.5 * np.sign(sharp)
     shape = np.minimum(np.asarray(ndimage.gaussian_filter(sharp, _SURFACE_BLUR)), sharp + _THIN_SLACK)
@@ -165,7 +168,7 @@ def thin_parts(solid: LatticeSolid) -> ThinParts:
     inside[:, :, 0] = inside[:, :, 2]
     # Opening by a block of two cells: the filters cover a point and the next one, and the one before it and the point.
     opened = ndimage.maximum_filter(ndimage.minimum_filter(inside, 2, origin=-1), 2)
-    thin = (inside & ~opened)[1:-1, 1:-1, 1:-1]
+    thin = (inside & np.logical_not(opened))[1:-1, 1:-1, 1:-1]
     labels = np.zeros(thin.shape, np.int32)
     ndimage.label(thin, structure=np.ones((3, 3, 3), bool), output=labels)
     order = np.argsort(-np.bincount(labels.ravel())[1:], kind="stable")
@@ -240,9 +243,9 @@ def _signed_distances(
             indices=wp.array(np.ascontiguousarray(faces).ravel(), dtype=wp.int32),
             support_winding_number=True,
         )
-        nodes = origin - centre + spacing * np.stack(np.indices(counts), axis=-1).reshape(-1, 3)
+        nodes = origin - centre + spacing * np.moveaxis(np.indices(tuple(counts.tolist())), 0, -1).reshape(-1, 3)
         points = wp.array(nodes.astype(np.float32), dtype=wp.vec3)
-        distances = wp.empty(len(nodes), dtype=wp.float32)
+        distances = empty(len(nodes), wp.float32, device)
     reach = spacing * float(np.linalg.norm(counts))
     launch_rows(
         surface_distance_kernel,

@@ -70,7 +70,7 @@ def test_gradient_is_the_derivative_also_outside_of_the_lattice(box: LevelSet) -
 def test_the_surface_passes_through_outer_points_that_were_not_fitted() -> None:
     """A ball of radius 1 on z = 0, from a lattice that is half a cell too large."""
     spacing, centre = 1.0 / 20.0, np.array([0.0, 0.0, 1.0])
-    indices = np.stack(np.indices((45, 45, 43)), axis=-1) - [22, 22, 0]
+    indices = np.moveaxis(np.indices((45, 45, 43)), 0, -1) - [22, 22, 0]
     inside = np.linalg.norm(spacing * indices - centre, axis=-1) < 1.0 + 0.5 * spacing
     arms = np.random.default_rng(2).normal(size=(3000, 3))
     arms /= np.linalg.norm(arms, axis=1, keepdims=True)
