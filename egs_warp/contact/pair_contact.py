@@ -23,8 +23,14 @@ from egs_warp.meshing.level_set import LevelSet
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 from egs_warp.short_repr import short_repr
 
-BOX_INFLATION = 2.0
-"""Inflation of the boxes of bodies and tetrahedra, in activation distances. A selected point is dropped at this gap."""
+BODY_INFLATION = 1.0
+"""Inflation of the box of each body, in its activation distances."""
+TET_INFLATION = 2.0
+"""Inflation of the boxes of the tetrahedra, in activation distances: a selected point is dropped at this gap. Parts of
+a body that are further outside of its cage cannot be touched, because elements extrapolate badly.
+"""
+_STRETCH = 1.01
+"""Bound of the stretch of a prop, whose single tetrahedron extrapolates exactly."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +93,7 @@ class PairContactDetector:
         sizes = [len(body.geometry.mesh.nodes) for body in bodies]
         self.node_starts = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
         """(nbody + 1,) first node of each body, and the number of all nodes."""
+        self._margins = [BODY_INFLATION * body.selector.activation_distance + _protrusion(body) for body in bodies]
         self._states = [_DeformedBody(body, self.device) for body in bodies]
 
     def body_pairs(self, positions: np.ndarray) -> list[tuple[int, int]]:
@@ -94,8 +101,8 @@ class PairContactDetector:
         and (b, a), in ascending order.
         """
         boxes = [
-            (part.min(axis=0) - state.margin, part.max(axis=0) + state.margin)
-            for part, state in zip(self._split(positions), self._states, strict=True)
+            (part.min(axis=0) - margin, part.max(axis=0) + margin)
+            for part, margin in zip(self._split(positions), self._margins, strict=True)
         ]
         lows, highs = (np.array(each).reshape(-1, 3) for each in zip(*boxes, strict=True))
         overlaps = np.all((lows[:, None] <= highs) & (lows <= highs[:, None]), axis=2)
@@ -189,7 +196,7 @@ class _DeformedBody:
 
     def __init__(self, body: PairBody, device: wp.Device) -> None:
         geometry, mesh, self.device = body.geometry, body.geometry.mesh, device
-        self.margin = BOX_INFLATION * body.selector.activation_distance
+        self._margin = TET_INFLATION * body.selector.activation_distance + _protrusion(body)
         self.points = [
             wp.array(mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device),
             wp.array(geometry.weights, dtype=Vec4, device=device),
@@ -218,7 +225,7 @@ class _DeformedBody:
         return self._tets_of[other]
 
     def _compute_boxes(self) -> None:
-        inputs = [self._tets, self.margin, self.positions]
+        inputs = [self._tets, self._margin, self.positions]
         launch_cached(
             kernels.tet_boxes_kernel,
             (1, len(self._tets)),
@@ -226,3 +233,16 @@ class _DeformedBody:
             outputs=[self._lowers, self._uppers],
             device=self.device,
         )
+
+
+def _protrusion(body: PairBody) -> float:
+    """Return an upper bound of the distance (m) of the contact points of a prop from its tetrahedron; 0 for a cage of
+    several tetrahedra, which encloses the body.
+    """
+    mesh, weights = body.geometry.mesh, body.geometry.weights
+    if len(mesh.tets) > 1:
+        return 0.0
+    inside = np.maximum(weights, 0.0)
+    inside /= inside.sum(axis=1, keepdims=True)
+    offsets = (weights - inside) @ mesh.nodes[mesh.tets[0]]
+    return _STRETCH * float(np.linalg.norm(offsets, axis=1).max())
