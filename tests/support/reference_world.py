@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from egs_warp.contact.coulomb import coulomb_forces
-from egs_warp.contact.detection import ContactDetector, push_out_speeds
+from egs_warp.contact.detection import ContactDetector
 from egs_warp.contact.newton import DELASSUS_REGULARIZATION
 from egs_warp.contact.pair_contact import PairBody, PairContactDetector, PairContactSet
 from egs_warp.fem.body import BodyState, SoftBody
@@ -62,11 +62,14 @@ class ReferenceWorld:
             contacts = ground.contact_set(selected, state.positions)
             first, last = 3 * self.detector.node_starts[i : i + 2]
             embedded = np.zeros((3 * contacts.count, 3 * self.detector.node_starts[-1]))
-            embedded[:, first:last] = contacts.dense_jacobian
+            embedded[:, first:last] = contacts.jacobian.toarray()
             rows.append(embedded)
             gaps.append(contacts.gaps)
-        jacobian, height = np.concatenate(rows), min(body.height for body in self.bodies)
-        bias = push_out_speeds(np.concatenate(gaps), dt, 0.05 * np.sqrt(9.81 * height), 0.2, 5e-3 * height)
+        jacobian, gap = np.concatenate(rows), np.concatenate(gaps)
+        height = min(body.height for body in self.bodies)
+        # The normal measure without the velocity (docs/concepts/contact.md): deep points are pushed out slowly.
+        push_out = np.maximum(0.2 * np.minimum(gap + 5e-3 * height, 0.0) / dt, -0.05 * np.sqrt(9.81 * height))
+        bias = np.maximum(gap, 0.0) / dt + push_out
         velocities, forces = [problem.rigid_guess for problem in problems], np.zeros((len(bias), 3))
         for iteration in range(MAX_ITERATIONS):
             impulses = self.split(dt * jacobian.T @ forces.ravel())
