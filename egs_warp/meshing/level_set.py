@@ -27,6 +27,8 @@ EXPOSURE_RADIUS = 4.0
 """Radius in cells of the empty balls that reach the outer points of a body (``outer_points``)."""
 _MARGIN = 5
 """Number of cells between the body and the boundary of the lattice."""
+_MIN_THIN_CELLS = 8
+"""Minimum number of cells of a thin part; smaller ones are the roughness of the surface."""
 _FILTER_MARGIN = 4
 """Number of nodes outside the lattice whose values affect the coefficients of the spline."""
 _SURFACE_BLUR = 0.9
@@ -171,9 +173,11 @@ def thin_parts(solid: LatticeSolid) -> ThinParts:
     thin = (inside & np.logical_not(opened))[1:-1, 1:-1, 1:-1]
     labels = np.zeros(thin.shape, np.int32)
     ndimage.label(thin, structure=np.ones((3, 3, 3), bool), output=labels)
-    order = np.argsort(-np.bincount(labels.ravel())[1:], kind="stable")
+    sizes = np.bincount(labels.ravel())[1:]
+    order = np.argsort(-sizes, kind="stable")
+    order = order[sizes[order] >= _MIN_THIN_CELLS]
     centres = np.array(ndimage.center_of_mass(thin, labels, 1 + order)).reshape(-1, 3)
-    return ThinParts(float(thin.sum() / solid.inside.sum()), solid.points(centres), 2.0 * solid.spacing)
+    return ThinParts(float(sizes[order].sum() / solid.inside.sum()), solid.points(centres), 2.0 * solid.spacing)
 
 
 def outer_points(points: np.ndarray, radius: float) -> np.ndarray:
