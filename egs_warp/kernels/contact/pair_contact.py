@@ -1,0 +1,214 @@
+"""Contact between the embedded points of a body and the level set of another, through its deformed tetrahedra.
+
+A point of body a at x lies in a tetrahedron of body b with barycentric weights w. At rest the same weights give X =
+sum w_i X_i, where the level set phi of b is evaluated. With the deformation gradient F of the tetrahedron and g = F^-T
+grad phi(X), the normal is n = g / |g| and the gap phi / |g|, the distance to first order. The derivative of phi is g
+with respect to x and -w_i g with respect to node i of b.
+"""
+
+import warp as wp
+
+from egs_warp.kernels.contact.gaps import embedded_point
+from egs_warp.kernels.contact.level_set import LevelSetLattice, level_set_value_and_gradient
+from egs_warp.kernels.deformation.embedding import least_weight, single
+from egs_warp.precision import Mat33, Vec3, Vec4, real
+
+wp.set_module_options({"enable_backward": False})
+
+MIN_SLOPE = wp.constant(wp.float64(0.5))
+"""Minimum |grad phi| of a gap. Near the middle of a body the slope of its level set vanishes."""
+
+
+@wp.func
+def edges_of(corners: wp.vec4i, positions: wp.array2d[Vec3], world: int) -> Mat33:
+    """Return the matrix whose columns are the edges of a tetrahedron from its first corner."""
+    first = positions[world, corners[0]]
+    return wp.matrix_from_cols(
+        positions[world, corners[1]] - first,
+        positions[world, corners[2]] - first,
+        positions[world, corners[3]] - first,
+    )
+
+
+@wp.func
+def weights_in_tet(corners: wp.vec4i, positions: wp.array2d[Vec3], world: int, x: Vec3) -> Vec4:
+    """Return the barycentric weights of ``x`` in a deformed tetrahedron; -inf if it is inverted."""
+    edges = edges_of(corners, positions, world)
+    if wp.determinant(edges) <= real(0.0):
+        return Vec4(real(-wp.inf))
+    w = wp.inverse(edges) * (x - positions[world, corners[0]])
+    return Vec4(real(1.0) - w[0] - w[1] - w[2], w[0], w[1], w[2])
+
+
+@wp.func
+def tet_at_point(x: Vec3, world: int, tets: wp.array[wp.vec4i], positions: wp.array2d[Vec3], boxes: wp.uint64) -> int:
+    """Return the deformed tetrahedron whose minimum barycentric weight at ``x`` is the largest, of several the first,
+    among those whose box contains ``x``; -1 if there is none. ``boxes`` has a group for each world.
+    """
+    coarse = single(x)
+    query = wp.bvh_query_aabb(boxes, coarse, coarse, wp.bvh_get_group_root(boxes, world))
+    candidate = int(0)
+    best = int(-1)
+    max_weight = real(-wp.inf)
+    while wp.bvh_query_next(query, candidate):
+        tet = candidate - world * tets.shape[0]
+        weight = least_weight(weights_in_tet(tets[tet], positions, world, x))
+        if weight > max_weight or (weight == max_weight and weight > real(-wp.inf) and tet < best):
+            max_weight = weight
+            best = tet
+    return best
+
+
+@wp.func
+def normal_and_gap(
+    weights: Vec4,
+    corners: wp.vec4i,
+    rest: wp.array2d[Vec3],
+    positions: wp.array2d[Vec3],
+    world: int,
+    lattice: LevelSetLattice,
+    coefficients: wp.array[float],
+) -> Vec4:
+    """Return the normal at a point and, as the last component, its gap in metres. Where the level set has no slope, the
+    normal is zero and the gap infinite.
+    """
+    level = level_set_value_and_gradient(lattice, coefficients, embedded_point(corners, weights, rest, 0))
+    gradient = Vec3(level[0], level[1], level[2])
+    slope = wp.length(gradient)
+    if slope < real(1.0e-9):
+        return Vec4(real(0.0), real(0.0), real(0.0), real(wp.inf))
+    rest_edges = edges_of(corners, rest, 0)
+    g = wp.transpose(wp.inverse(edges_of(corners, positions, world))) * (wp.transpose(rest_edges) * gradient)
+    length = wp.length(g)
+    gap = level[3] / (length * wp.max(real(1.0), MIN_SLOPE / slope))
+    return Vec4(g[0] / length, g[1] / length, g[2] / length, gap)
+
+
+@wp.func
+def frame_of_normal(n: Vec3) -> Mat33:
+    """Return the contact frame with rows n, t1, t2 for a unit normal. It is continuous except where |n_x| is 0.8, so
+    that rounding of a normal along an axis does not change it.
+    """
+    helper = Vec3(real(1.0), real(0.0), real(0.0))
+    if wp.abs(n[0]) > real(0.8):
+        helper = Vec3(real(0.0), real(1.0), real(0.0))
+    first = wp.normalize(wp.cross(helper, n))
+    return wp.matrix_from_rows(n, first, wp.cross(n, first))
+
+
+@wp.kernel
+def tet_boxes_kernel(
+    # Model:
+    tets: wp.array[wp.vec4i],
+    margin: real,
+    # In:
+    positions: wp.array2d[Vec3],
+    # Out:
+    lowers_out: wp.array[wp.vec3],
+    uppers_out: wp.array[wp.vec3],
+):
+    """Compute the boxes of the deformed tetrahedra of each world, inflated by ``margin`` metres."""
+    world, tet = wp.tid()
+    corners = tets[tet]
+    low = positions[world, corners[0]]
+    high = low
+    for i in range(1, 4):
+        x = positions[world, corners[i]]
+        low = wp.min(low, x)
+        high = wp.max(high, x)
+    inflation = Vec3(margin, margin, margin)
+    row = world * tets.shape[0] + tet
+    lowers_out[row] = single(low - inflation)
+    uppers_out[row] = single(high + inflation)
+
+
+@wp.kernel
+def pair_gaps_kernel(
+    # Model:
+    nodes: wp.array[wp.vec4i],
+    weights: wp.array[Vec4],
+    tets: wp.array[wp.vec4i],
+    rest: wp.array2d[Vec3],
+    boxes: wp.uint64,
+    lattice: LevelSetLattice,
+    coefficients: wp.array[float],
+    # In:
+    positions: wp.array2d[Vec3],
+    other_positions: wp.array2d[Vec3],
+    # Out:
+    gaps_out: wp.array2d[real],
+    tets_out: wp.array2d[int],
+):
+    """Compute the gap of each point of body a to body b, and the tetrahedron of b at the point; infinite and -1 away
+    from all of them.
+    """
+    world, point = wp.tid()
+    x = embedded_point(nodes[point], weights[point], positions, world)
+    tet = tet_at_point(x, world, tets, other_positions, boxes)
+    gap = real(wp.inf)
+    if tet >= 0:
+        corners = tets[tet]
+        shares = weights_in_tet(corners, other_positions, world, x)
+        gap = normal_and_gap(shares, corners, rest, other_positions, world, lattice, coefficients)[3]
+    gaps_out[world, point] = gap
+    tets_out[world, point] = tet
+
+
+@wp.kernel
+def pair_record_kernel(
+    # Model:
+    nodes: wp.array[wp.vec4i],
+    weights: wp.array[Vec4],
+    tets: wp.array[wp.vec4i],
+    rest: wp.array2d[Vec3],
+    boxes: wp.uint64,
+    lattice: LevelSetLattice,
+    coefficients: wp.array[float],
+    # In:
+    points: wp.array2d[int],
+    counts: wp.array[int],
+    end_tets: wp.array2d[int],
+    positions: wp.array2d[Vec3],
+    other_positions: wp.array2d[Vec3],
+    # Out:
+    nodes_out: wp.array2d[wp.vec4i],
+    weights_out: wp.array2d[Vec4],
+    other_nodes_out: wp.array2d[wp.vec4i],
+    other_weights_out: wp.array2d[Vec4],
+    axes_out: wp.array2d[Mat33],
+    gaps_out: wp.array2d[real],
+):
+    """Write nodes and weights on both sides, frame and gap of the first ``counts`` of the ``points`` (B, K) of body a
+    against body b, and zeros as padding.
+
+    A point that is away from all tetrahedra of b now, but not at the end of the step, has the tetrahedron of
+    ``end_tets`` (B, P), with weights that extrapolate. Without one, the axes are zero and the gap is infinite.
+    """
+    world, k = wp.tid()
+    record_nodes = wp.vec4i()
+    record_weights = Vec4()
+    other_nodes = wp.vec4i()
+    other_weights = Vec4()
+    frame = Mat33()
+    gap = real(0.0)
+    if k < counts[world]:
+        point = points[world, k]
+        record_nodes = nodes[point]
+        record_weights = weights[point]
+        x = embedded_point(record_nodes, record_weights, positions, world)
+        tet = tet_at_point(x, world, tets, other_positions, boxes)
+        if tet < 0:
+            tet = end_tets[world, point]
+        gap = real(wp.inf)
+        if tet >= 0:
+            other_nodes = tets[tet]
+            other_weights = weights_in_tet(other_nodes, other_positions, world, x)
+            normal = normal_and_gap(other_weights, other_nodes, rest, other_positions, world, lattice, coefficients)
+            frame = frame_of_normal(Vec3(normal[0], normal[1], normal[2]))
+            gap = normal[3]
+    nodes_out[world, k] = record_nodes
+    weights_out[world, k] = record_weights
+    other_nodes_out[world, k] = other_nodes
+    other_weights_out[world, k] = other_weights
+    axes_out[world, k] = frame
+    gaps_out[world, k] = gap

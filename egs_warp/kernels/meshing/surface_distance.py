@@ -1,0 +1,28 @@
+"""Signed distance of points from a closed triangle mesh."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def surface_distance_kernel(
+    first_row: wp.int32,
+    # Model:
+    mesh: wp.uint64,
+    # In:
+    points: wp.array[wp.vec3],
+    max_distance: float,
+    # Out:
+    distances_out: wp.array[float],
+):
+    """Compute the distance of each point from ``mesh``, negative where its winding number is above one half, and
+    ``max_distance`` where no triangle is as near.
+    """
+    i = first_row + wp.tid()
+    query = wp.mesh_query_point_sign_winding_number(mesh, points[i], max_distance)
+    distance = max_distance
+    if query.result:
+        nearest = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
+        distance = query.sign * wp.length(points[i] - nearest)
+    distances_out[i] = distance
