@@ -12,7 +12,7 @@ from typing import Protocol
 import torch
 import warp as wp
 
-from egs_warp.contact.batch_contacts import BatchContacts, append_points, padded, penetrating_points, point_gaps
+from egs_warp.contact.contact_set import ContactSet, push_out_speeds
 from egs_warp.contact.coupled_step import (
     ACTIVATION_RESIDUAL,
     COULOMB_TOLERANCE,
@@ -25,7 +25,7 @@ from egs_warp.contact.newton import DELASSUS_REGULARIZATION
 from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batch_problem import BatchMomentumProjection, BatchProblem, apply_inverse
-from egs_warp.fem.batched import BatchedRecord, launch_on, nonzero
+from egs_warp.fem.batched import BatchedRecord, launch_on, nonzero, padded
 from egs_warp.kernels.contact import newton_convergence as rule
 from egs_warp.precision import real
 
@@ -86,23 +86,20 @@ class BatchSolver:
     """Residual divided by dt x weight at which a world has converged."""
     stages: StageTimer = no_timer
 
-    def normal_bias(self, contacts: BatchContacts, dt: float) -> torch.Tensor:
+    def normal_bias(self, contacts: ContactSet, dt: float) -> torch.Tensor:
         """Return (c, K) m/s, the velocity bias of ``push_out_speeds``."""
-        gaps = contacts.gaps
-        deep = ((gaps + self.penetration_tolerance).clamp(max=0.0) * PUSH_OUT_FRACTION / dt).clamp(
-            min=-self.push_out_cap
-        )
-        return (gaps.clamp(min=0.0) / dt + deep) * contacts.valid
+        slop = self.penetration_tolerance
+        return push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT_FRACTION, slop) * contacts.valid
 
     def linearize(
-        self, problem: BatchProblem, contacts: BatchContacts, momentum_projection: BatchMomentumProjection | None = None
+        self, problem: BatchProblem, contacts: ContactSet, momentum_projection: BatchMomentumProjection | None = None
     ) -> BatchLinearization:
         """Linearise ``contacts`` with the tangents in the worlds' slots; the momentum projection is computed unless it
         is passed.
         """
         with self.stages("substitute"):
             columns, momentum_projection = apply_inverse(
-                problem, problem.dt * contacts.jacobian_transposed(problem.positions.shape[1]), momentum_projection
+                problem, problem.dt * contacts.jacobian_transposed(), momentum_projection
             )
         delassus = contacts.contact_velocities(columns)
         diagonal = delassus.diagonal(dim1=1, dim2=2)
@@ -112,7 +109,7 @@ class BatchSolver:
 
     def solve_coulomb(
         self,
-        contacts: BatchContacts,
+        contacts: ContactSet,
         response: BatchLinearization,
         free: torch.Tensor,
         shift: torch.Tensor,
@@ -133,13 +130,13 @@ class BatchSolver:
             (c, K, 3) newtons, and their violation of the law (c,) in m/s.
         """
         with self.stages("coulomb"):
-            speeds = contacts.contact_velocities(free.flatten(1)[:, :, None])[:, :, 0]
+            speeds = contacts.contact_velocities(free.flatten(1))
             return coulomb_forces_batch(contacts.counts, response.delassus, speeds, shift, frictions, start)
 
     def solve(
         self,
         problem: BatchProblem,
-        contacts: BatchContacts,
+        contacts: ContactSet,
         response: BatchLinearization,
         tensions: torch.Tensor,
         frictions: torch.Tensor,
@@ -147,7 +144,7 @@ class BatchSolver:
         velocities: torch.Tensor,
         forces: torch.Tensor,
         start_gaps: tuple[torch.Tensor, torch.Tensor],
-    ) -> tuple[BatchContacts, BatchResult]:
+    ) -> tuple[ContactSet, BatchResult]:
         """Solve the steps with Newton's method.
 
         Args:
@@ -188,8 +185,8 @@ class BatchSolver:
             if len(more) == 0:
                 break
             positions, *gaps_there = (each[todo[more]] for each in (problem.positions, *start_gaps))
-            points, counts = append_points(self.points, active_contacts.gather(more), added[more], ends[more])
-            grown = BatchContacts.at(self.detector, points, counts, positions, gaps_there)
+            points, counts = self.points.append_in_worlds(active_contacts.gather(more), added[more], ends[more])
+            grown = self.detector.contact_sets(points, counts, positions, gaps_there)
             grown = grown.with_capacity(max(grown.capacity, contacts.capacity))
             extra = grown.capacity - contacts.capacity
             forces = padded(done.forces[more], extra)
@@ -206,9 +203,9 @@ class BatchSolver:
         """Return (c, C), the points of each cell that would be too deep at the end of the step with ``velocities`` (c,
         N, 3), or -1, and (c, P) m, all gaps at the end.
         """
-        gaps, _ = point_gaps(self.detector, task.problem.end_positions(velocities))
+        gaps, _ = self.detector.gaps_of_worlds(task.problem.end_positions(velocities))
         tolerance = self.penetration_tolerance
-        return penetrating_points(self.points, task.contacts, (gaps, task.start_gaps), tolerance), gaps
+        return self.points.find_penetrating_in_worlds(task.contacts, (gaps, task.start_gaps), tolerance), gaps
 
     def _round(
         self,
@@ -324,7 +321,7 @@ class _RoundInputs(BatchedRecord):
     """Inputs of a round of c worlds."""
 
     problem: BatchProblem
-    contacts: BatchContacts
+    contacts: ContactSet
     normal_bias: torch.Tensor
     """(c, K) m/s."""
     tensions: torch.Tensor
@@ -342,7 +339,7 @@ class _RoundInputs(BatchedRecord):
         """
         problem = self.problem
         free = problem.residual(velocities, self.tensions)
-        rest = free - problem.dt * self.contacts.nodal_forces(forces, velocities.shape[1])
+        rest = free - problem.dt * self.contacts.nodal_forces(forces)
         return free, rest.flatten(1).norm(dim=1) / problem.residual_scale
 
 

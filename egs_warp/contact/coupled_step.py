@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from egs_warp.contact.detection import ContactDetector, ContactSet, push_out_speeds
+from egs_warp.contact.contact_set import ContactSet, push_out_speeds
+from egs_warp.contact.detection import ContactDetector
 from egs_warp.contact.newton import ContactLinearization, NewtonIterate, PenetrationCheck
 from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
 from egs_warp.contact.selection import ACTIVATION_DEPTH, ContactSelector

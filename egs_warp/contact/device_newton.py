@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.device_newton_workspace import FROM_BASE, FROM_TRIAL, NewtonWorkspace, TrialReadback
 from egs_warp.contact.device_step import SolveEnd, StepWorkspace
 from egs_warp.contact.newton import ContactLinearization, NewtonStepResult, PenetrationCheck

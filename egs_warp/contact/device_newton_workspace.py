@@ -20,19 +20,18 @@ import numpy as np
 import torch
 import warp as wp
 
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coulomb import FAILURE_TOLERANCE
-from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.device_coulomb import CoulombWorkspace
-from egs_warp.contact.device_step import StepWorkspace, vectors
+from egs_warp.contact.device_step import StepWorkspace, one_world, vectors
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.kernels.contact import contacts as contact_kernels
 from egs_warp.kernels.contact import iterate as kernels
 from egs_warp.kernels.contact import newton_convergence as convergence_kernels
 from egs_warp.muscles.tension import MuscleEnergy
-from egs_warp.precision import Mat33, Vec3, Vec4, real
+from egs_warp.precision import Mat33, Vec3, real
 
 FROM_BASE, FROM_TRIAL, FROM_START = 0.0, 1.0, 2.0
 """Slot that a trial starts from: the base as it is, the last trial, or the start buffer."""
@@ -78,13 +77,11 @@ class NewtonWorkspace:
         )
         self._indices = torch.zeros(5 * capacity, dtype=torch.int32, device=count.device)
         self._points, nodes = self._indices.split([capacity, 4 * capacity])
-        self._contacts = [
-            as_warp(nodes.view(-1, 4), wp.vec4i),
-            *(as_warp(weights.view(-1, 4), Vec4), as_warp(axes.view(-1, 3, 3), Mat33)),
-        ]
-        # The batch kernels take a leading world axis.
-        counts = wp.array([capacity], dtype=int, device=self._device)
-        self._batch_contacts = [counts, *(each.reshape((1, capacity)) for each in self._contacts)]
+        self._contacts = ContactSet(
+            *(self._points[None], nodes.view(1, -1, 4), weights.view(1, -1, 4), axes.view(1, -1, 3, 3), None, None),
+            *(self._node_count, torch.full((1,), capacity, dtype=torch.int32, device=count.device)),
+        )
+        """The uploaded contacts of one world. Padding has zero weights and counts as contacts."""
         self.columns = owner.zeros(size, width)
         self._right, self.delassus = owner.zeros(size, 3 + width), owner.zeros(width, width)
         self._host_delassus = owner.stream.pinned(width * width)
@@ -138,17 +135,7 @@ class NewtonWorkspace:
 
     def contact_velocities(self, velocities: torch.Tensor) -> torch.Tensor:
         """Return (3K, j) m/s, W v for nodal ``velocities`` v (3N, j)."""
-        out = velocities.new_empty((3 * self.capacity, velocities.shape[1]))
-        self._enqueue_contact_velocities(velocities, out)
-        return out
-
-    def _enqueue_contact_velocities(self, velocities: torch.Tensor, out: torch.Tensor) -> None:
-        self._launch(
-            contact_kernels.contact_velocities_kernel,
-            (1, self.capacity, velocities.shape[1]),
-            [*self._batch_contacts, as_warp(velocities[None], real)],
-            [as_warp(out[None], real)],
-        )
+        return self._contacts.contact_velocities(velocities[None])[0]
 
     def linearize(self, problem: StepProblem, contacts: ContactSet) -> None:
         """Linearise ``contacts`` with the current factors, asynchronously."""
@@ -208,17 +195,12 @@ class NewtonWorkspace:
         momenta, impulses = self._right[:, :3], self._right[:, 3:]
         torch.mul(owner.rotation_modes, owner.masses.repeat_interleave(3)[:, None], out=momenta)
         impulses.zero_()
-        self._launch(
-            contact_kernels.contact_jacobian_kernel,
-            (1, self.capacity),
-            self._batch_contacts,
-            [as_warp(impulses[None], real)],
-        )
+        self._contacts.jacobian_transposed(out=impulses[None])
         impulses.mul_(dt)
         solved = factors.enqueue_solve(self._right)
         factors.enqueue_momentum_projection(owner.rotation_modes, momenta, solved[:, :3], ratio)
         torch.addmm(solved[:, 3:], factors.rotation_response, factors.rotation_operator @ impulses, out=self.columns)
-        self._enqueue_contact_velocities(self.columns, self.delassus)
+        self._contacts.contact_velocities(self.columns[None], out=self.delassus[None])
         self.coulomb.enqueue_operator(self.delassus)
         self._host_delassus.copy_(self.delassus.view(-1), non_blocking=True)
 
@@ -446,7 +428,7 @@ class NewtonWorkspace:
         """
         velocities, free_velocities, residual, _ = self.parts(state)
         self._enqueue_free_velocities(velocities, residual, free_velocities)
-        self._enqueue_contact_velocities(free_velocities[:, None], self.free_contact_velocities[:, None])
+        self._contacts.contact_velocities(free_velocities[None], out=self.free_contact_velocities[None])
 
     def _enqueue_free_velocities(self, velocities: torch.Tensor, residual: torch.Tensor, end: torch.Tensor) -> None:
         """Compute the velocities after a Newton step.
@@ -537,13 +519,14 @@ class NewtonWorkspace:
         owner.enqueue_gradient(vectors(self.end_positions), dt, self._tensions, vectors(self._gradient))
         torch.mv(owner.rotation_modes.T, self._gradient, out=self._torque)
         gravity = Vec3(*(float(each) for each in owner.body.gravity))
+        inertia = as_warp(owner.inverse_inertia.view(1, 3, 3), Mat33)
         self._launch(
             kernels.residual_kernel,
-            nodes,
+            (1, nodes),
             [
-                *(as_warp(owner.masses, real), gravity, ratio, dt, vectors(owner.lever_arms)),
-                *(as_warp(owner.inverse_inertia.view(1, 3, 3), Mat33), vectors(owner.velocities), *self._contacts),
-                *(vectors(self._torque), vectors(self._gradient), vectors(velocities), vectors(forces)),
+                *(as_warp(owner.masses, real), gravity, ratio, dt, one_world(owner.lever_arms), inertia),
+                *(one_world(owner.velocities), *self._contacts.arrays, vectors(self._torque)),
+                *(one_world(each) for each in (self._gradient, velocities, forces)),
             ],
-            [vectors(free_residual), vectors(self._residual)],
+            [one_world(free_residual), one_world(self._residual)],
         )

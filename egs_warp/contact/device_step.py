@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.prefetch import ContactPrefetch
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.body import BodyState, SoftBody
@@ -124,12 +124,12 @@ class StepWorkspace:
         wp.launch(
             kernels.step_start_kernel,
             (1, lanes),
-            inputs=[dt, as_warp(self.masses, real), *map(_one_world, (self.positions, self.velocities))],
+            inputs=[dt, as_warp(self.masses, real), *map(one_world, (self.positions, self.velocities))],
             outputs=[
-                _one_world(self.lever_arms),
+                one_world(self.lever_arms),
                 as_warp(self.rotation_modes[None], real),
                 as_warp(self.inverse_inertia, Mat33),
-                _one_world(self.rigid_guess),
+                one_world(self.rigid_guess),
             ],
             device=device,
             block_dim=lanes,
@@ -232,6 +232,6 @@ def vectors(flat: torch.Tensor) -> wp.array:
     return as_warp(flat.view(-1, 3), Vec3)
 
 
-def _one_world(flat: torch.Tensor) -> wp.array:
+def one_world(flat: torch.Tensor) -> wp.array:
     """View a ``flat`` tensor (3N,) as a Warp array (1, N) of vectors."""
     return as_warp(flat.view(1, -1, 3), Vec3)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.simd_elasticity import SimdElasticity
 from egs_warp.fem.step_problem import StepProblem, Tangent

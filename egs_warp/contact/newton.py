@@ -14,8 +14,8 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coulomb import coulomb_forces
-from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.host_newton import HostNewtonWorkspace, IterateBuffer, address_of, host_newton_workspace
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.body import BodyState
@@ -41,7 +41,7 @@ class ContactLinearization:
     def of(cls, tangent: Tangent, contacts: ContactSet, columns: np.ndarray | None = None) -> ContactLinearization:
         """Linearise ``contacts`` with ``tangent``; ``columns`` are computed unless they are passed."""
         if columns is None:
-            columns = tangent.solve(contacts.dense_jacobian.T)
+            columns = tangent.solve(contacts.jacobian_transposed())
             columns *= tangent.problem.dt
         return cls(tangent, contacts, columns)
 
@@ -81,7 +81,7 @@ class ContactLinearization:
 
     def with_added_contacts(self, contacts: ContactSet) -> ContactLinearization:
         """Return the linearisation of ``contacts``, of which the first are the current ones, with the same tangent."""
-        new = contacts.dense_jacobian[3 * self.contacts.count :].T
+        new = contacts.jacobian_transposed()[:, 3 * self.contacts.count :]
         columns = np.hstack([self.columns, self.tangent.problem.dt * self.tangent.solve(new)])
         return ContactLinearization.of(self.tangent, contacts, columns)
 

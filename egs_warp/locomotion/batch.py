@@ -12,13 +12,13 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 
-from egs_warp.contact.batch_contacts import BatchContacts, padded, point_gaps, select_contacts
 from egs_warp.contact.batch_step import BatchLinearization, BatchResult, BatchSolver, StageTimer, no_timer
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coupled_step import CoupledSolver
-from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
+from egs_warp.contact.detection import ContactDetector, ContactGeometry
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batch_problem import BatchBody, BatchProblem, apply_inverse
-from egs_warp.fem.batched import BatchedRecord, nonzero
+from egs_warp.fem.batched import BatchedRecord, nonzero, padded
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.panel_cholesky import CHUNK_BYTES, PANEL
 from egs_warp.locomotion.settings import LocomotionSettings
@@ -55,7 +55,7 @@ class BatchStep(BatchedRecord):
     dt: float
     """s."""
     after: BatchState
-    contacts: BatchContacts
+    contacts: ContactSet
     forces: torch.Tensor
     """(c, K, 3) N."""
     end_gaps: torch.Tensor
@@ -79,36 +79,18 @@ class BatchStep(BatchedRecord):
     def reports(self) -> list[StepReport]:
         """Download the step; return one report for each of ``worlds``, like that of a single stepper but without
         timings."""
-        state, contacts = self.after, self.contacts
-        host = [
-            each.cpu().numpy()
-            for each in (state.positions, state.velocities, state.time, contacts.counts, contacts.points)
-        ]
-        positions, velocities, times, counts, points = host
-        nodes, weights, axes, gaps, faces, forces, end_gaps = (
-            each.cpu().numpy()
-            for each in (
-                *(contacts.nodes, contacts.weights, contacts.axes, contacts.gaps, contacts.faces),
-                *(self.forces, self.end_gaps),
-            )
-        )
-        min_gap, activations, iterations, converged, spins = (
-            each.cpu().numpy()
-            for each in (self.min_gap, self.activations, self.iterations, self.converged, self.added_spin)
-        )
+        values = self.after.positions, self.after.velocities, self.after.time, self.forces, self.end_gaps
+        positions, velocities, times, forces, end_gaps = (each.cpu().numpy() for each in values)
+        values = self.min_gap, self.activations, self.iterations, self.converged, self.added_spin
+        min_gap, activations, iterations, converged, spins = (each.cpu().numpy() for each in values)
         reports = []
-        for world, count in enumerate(counts.tolist()):
-            valid = slice(0, count)
-            contact_set = ContactSet(
-                *(points[world, valid].astype(int), nodes[world, valid], weights[world, valid], axes[world, valid]),
-                *(gaps[world, valid], faces[world, valid], positions.shape[1]),
-            )
+        for world, contacts in enumerate(self.contacts.download()):
             report = StepReport(
                 state=BodyState(positions[world], velocities[world], float(times[world])),
                 dt=self.dt,
-                contacts=contact_set,
-                forces=forces[world, valid],
-                end_gaps=end_gaps[world, valid],
+                contacts=contacts,
+                forces=forces[world, : contacts.count],
+                end_gaps=end_gaps[world, : contacts.count],
                 min_gap=float(min_gap[world]),
                 activations=activations[world],
                 qp_count=0,
@@ -320,20 +302,20 @@ class BatchStepper:
 
     def _detect(
         self, problem: BatchProblem, state: BatchState
-    ) -> tuple[BatchContacts, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+    ) -> tuple[ContactSet, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
         """Return the contacts, their forces (c, K, 3) N in the previous step, and gaps and faces at the start."""
         ballistic = state.velocities + problem.dt * self.common.gravity
-        gaps, _ = point_gaps(self.detector, problem.end_positions(ballistic))
+        gaps, _ = self.detector.gaps_of_worlds(problem.end_positions(ballistic))
         previous = state.points, state.counts, (state.forces[:, :, 0] > 0.0).int()
-        chosen = select_contacts(self.selector, previous, gaps)
-        start_gaps = point_gaps(self.detector, state.positions)
-        contacts = BatchContacts.at(self.detector, *chosen, state.positions, start_gaps)
-        return contacts, contacts.transferred_forces(state.points, state.counts, state.forces), start_gaps
+        chosen = self.selector.select_in_worlds(previous, gaps)
+        start_gaps = self.detector.gaps_of_worlds(state.positions)
+        contacts = self.detector.contact_sets(*chosen, state.positions, start_gaps)
+        return contacts, contacts.transferred_forces(state.points, state.forces, state.counts), start_gaps
 
     def _predict(
         self,
         problem: BatchProblem,
-        contacts: BatchContacts,
+        contacts: ContactSet,
         previous_forces: torch.Tensor,
         tensions: torch.Tensor,
         frictions: torch.Tensor,
@@ -350,7 +332,7 @@ class BatchStepper:
             failed = ~problem.factor(velocities, None)
         with stages("elasticity"):
             residual = problem.residual(velocities, tensions)
-        residual = residual - problem.dt * contacts.nodal_forces(previous_forces, velocities.shape[1])
+        residual = residual - problem.dt * contacts.nodal_forces(previous_forces)
         with stages("substitute"):
             newton_step, _ = apply_inverse(problem, residual.flatten(1)[:, :, None])
         trial = velocities - newton_step.view_as(velocities)
@@ -387,14 +369,14 @@ class BatchStepper:
     def _finish(
         self,
         problem: BatchProblem,
-        contacts: BatchContacts,
+        contacts: ContactSet,
         result: BatchResult,
         state: BatchState,
         activations: torch.Tensor,
     ) -> BatchStep:
         end = problem.end_positions(result.velocities)
         with self._stages("detect"):
-            gaps, _ = point_gaps(self.detector, end)
+            gaps, _ = self.detector.gaps_of_worlds(end)
         internal = problem.internal_gradient(result.velocities, self._stiffness * activations)
         after = BatchState(
             *(state.worlds, end, result.velocities, state.time + problem.dt),

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coupled_step import CoupledResult, CoupledSolver
-from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
+from egs_warp.contact.detection import ContactDetector, ContactGeometry
 from egs_warp.contact.newton import ContactLinearization, ContactLinearizer, HostContactLinearizer
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.body import BodyState, SoftBody
@@ -198,7 +199,7 @@ class LocomotionStepper:
         problem = StepProblem(self.body, state, dt)
         contacts = self._detect(problem, memory)
         response = self.linearizer(problem.tangent(self.factors, problem.rigid_guess, None), contacts)
-        forces = self.selector.transfer_forces(contacts.points, memory.points, memory.forces)
+        forces = contacts.transferred_forces(memory.points, memory.forces)
         return self.solver.solve(response, None, velocities=problem.rigid_guess, forces=forces)
 
     def advance(
@@ -353,7 +354,7 @@ class LocomotionStepper:
     def step_inputs(self, problem: StepProblem, contacts: ContactSet, memory: WarmStart) -> StepInputs:
         """Collect the inputs of a step with these ``contacts``: velocity bias, and the previous activations and contact
         forces of ``memory``."""
-        previous_forces = self.selector.transfer_forces(contacts.points, memory.points, memory.forces)
+        previous_forces = contacts.transferred_forces(memory.points, memory.forces)
         bias = self.solver.normal_bias(contacts, problem.dt)
         return StepInputs(problem, contacts, bias, self.geometry.friction, memory.activations, previous_forces)
 

@@ -51,7 +51,7 @@ def test_a_newton_step_solves_the_linear_equation(creature: Creature) -> None:
     whole, half = still.line_search_point(small), still.line_search_point(small, 0.5)
     assert still.residual_norm < 1e-10 and whole.residual_norm < 1e-9 and half.residual_norm < 1e-9
     assert np.array_equal(whole.forces, small) and np.array_equal(half.forces, 0.5 * small)
-    moved = problem.dt * response.tangent.solve(contacts.dense_jacobian.T @ small.ravel())
+    moved = problem.dt * response.tangent.solve(contacts.jacobian.T @ small.ravel())
     np.testing.assert_allclose((whole.velocities - velocities).ravel(), moved, atol=1e-9 * np.abs(moved).max())
     expected = contacts.contact_velocities(velocities.ravel())
     np.testing.assert_allclose(still.free_contact_velocities, expected, atol=1e-9 * np.abs(expected).max())

@@ -44,7 +44,7 @@ class PassiveBody:
         chosen = solver.points.select(self.points, self.forces[:, 0] > 0.0, gaps)
         contacts = solver.detector.contact_set(chosen, state.positions)
         tangent = problem.tangent(self.factors, problem.rigid_guess, tension)
-        start = solver.points.transfer_forces(chosen, self.points, self.forces)
+        start = contacts.transferred_forces(self.points, self.forces)
         response = ContactLinearization.of(tangent, contacts)
         result = solver.solve(response, tension, velocities=problem.rigid_guess, forces=start)
         self.state = BodyState(problem.end_positions(result.velocities), result.velocities, state.time + dt)

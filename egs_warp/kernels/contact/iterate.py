@@ -6,6 +6,7 @@ The host code is ``egs_warp/contact/device_newton_workspace.py``; ``iterate_cpu`
 
 import warp as wp
 
+from egs_warp.kernels.contact.contacts import nodal_force
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -81,38 +82,32 @@ def residual_kernel(
     gravity: Vec3,
     ratio: real,
     dt: real,
-    arms: wp.array[Vec3],
-    turning_rates: wp.array[Mat33],
-    old_velocities: wp.array[Vec3],
-    nodes: wp.array[wp.vec4i],
-    weights: wp.array[Vec4],
-    axes: wp.array[Mat33],
+    arms: wp.array2d[Vec3],
+    inverse_inertia: wp.array[Mat33],
+    old_velocities: wp.array2d[Vec3],
+    counts: wp.array[int],
+    nodes: wp.array2d[wp.vec4i],
+    weights: wp.array2d[Vec4],
+    axes: wp.array2d[Mat33],
     # In:
     torque: wp.array[Vec3],
-    internal: wp.array[Vec3],
-    velocities: wp.array[Vec3],
-    forces: wp.array[Vec3],
+    internal: wp.array2d[Vec3],
+    velocities: wp.array2d[Vec3],
+    forces: wp.array2d[Vec3],
     # Out:
-    free_out: wp.array[Vec3],
-    rest_out: wp.array[Vec3],
+    free_out: wp.array2d[Vec3],
+    rest_out: wp.array2d[Vec3],
 ):
-    """Compute ``StepProblem.residual`` in N s, without contact forces and with them.
+    """Compute ``StepProblem.residual`` of all worlds in N s, without contact forces and with them.
 
-    ``internal`` is the internal gradient, in newtons (minus the forces), and ``torque`` its torque in N m. Padded
-    contacts have zero weight.
+    ``internal`` is the internal gradient, in newtons (minus the forces), and ``torque`` its torque in N m.
     """
-    node = wp.tid()
-    spin = dt * (turning_rates[0] * torque[0])
-    change = ratio * velocities[node] - old_velocities[node] - dt * gravity - wp.cross(spin, arms[node])
-    free = masses[node] * change + dt * internal[node]
-    contact_force = Vec3(real(0.0))
-    for contact in range(nodes.shape[0]):
-        corners = nodes[contact]
-        for corner in range(4):
-            if corners[corner] == node:
-                contact_force += weights[contact][corner] * (wp.transpose(axes[contact]) * forces[contact])
-    free_out[node] = free
-    rest_out[node] = free - dt * contact_force
+    world, node = wp.tid()
+    spin = dt * (inverse_inertia[world] * torque[world])
+    change = ratio * velocities[world, node] - old_velocities[world, node] - dt * gravity
+    free = masses[node] * (change - wp.cross(spin, arms[world, node])) + dt * internal[world, node]
+    free_out[world, node] = free
+    rest_out[world, node] = free - dt * nodal_force(counts, nodes, weights, axes, forces, world, node)
 
 
 @wp.kernel
