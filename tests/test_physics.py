@@ -77,7 +77,7 @@ def spin_work(problem: StepProblem, result: CoupledResult) -> float:
     """Return the work, J, of the momentum correction w x r in a step without muscles: w times the angular momentum of
     the end velocities with the lever arms of the start."""
     given = problem.momentum_correction(problem.internal_gradient(result.velocities, None))
-    momenta = problem.mass * np.cross(problem.lever_arms, result.velocities)
+    momenta = problem.node_mass[:, None] * np.cross(problem.lever_arms, result.velocities)
     return float(given @ momenta.sum(axis=0))
 
 

@@ -12,20 +12,13 @@ from typing import Protocol
 import torch
 import warp as wp
 
-from egs_warp.contact.contact_set import ContactSet, push_out_speeds
-from egs_warp.contact.coupled_step import (
-    ACTIVATION_RESIDUAL,
-    COULOMB_TOLERANCE,
-    MAX_ACTIVATION_ROUNDS,
-    PUSH_OUT_FRACTION,
-)
-from egs_warp.contact.detection import ContactDetector
-from egs_warp.contact.device_coulomb import coulomb_forces_batch
-from egs_warp.contact.newton import DELASSUS_REGULARIZATION
-from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
-from egs_warp.contact.selection import ContactSelector
-from egs_warp.fem.batch_problem import BatchMomentumProjection, BatchProblem, apply_inverse
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.coulomb import DELASSUS_REGULARIZATION, coulomb_forces_of_worlds, regularized
+from egs_warp.contact.coupled_step import MAX_ACTIVATION_ROUNDS, NewtonOptions
+from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS
+from egs_warp.fem.batch_problem import BatchProblem, apply_inverse
 from egs_warp.fem.batched import BatchedRecord, launch_on, nonzero, padded
+from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.kernels.contact import newton_convergence as rule
 from egs_warp.precision import real
 
@@ -47,11 +40,50 @@ def no_timer(name: str) -> AbstractContextManager[object]:
 class BatchLinearization(BatchedRecord):
     """``ContactLinearization`` of c worlds, with the tangents in their slots."""
 
-    momentum_projection: BatchMomentumProjection
+    momentum_projection: MomentumProjection
     columns: torch.Tensor
     """(c, 3N, 3K) m/s per newton, dt J^-1 W^T."""
     delassus: torch.Tensor
     """(c, 3K, 3K) m/(N s), the regularised Delassus operator."""
+
+
+@dataclass(frozen=True)
+class BatchInputs(BatchedRecord):
+    """Inputs of Newton's method in c worlds."""
+
+    problem: BatchProblem
+    contacts: ContactSet
+    normal_bias: torch.Tensor
+    """(c, K) m/s, bias of the normal velocities."""
+    tensions: torch.Tensor
+    """(c, M) newtons, muscle tensions."""
+    frictions: torch.Tensor
+    """(c,) Coulomb coefficients."""
+    start_gaps: torch.Tensor
+    """(c, P) m, gaps of all points at the start of the step."""
+    start_faces: torch.Tensor
+    """(c, P) int32, their faces."""
+
+    def residuals(self, velocities: torch.Tensor, forces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (c, N, 3) N s, the residuals at ``velocities`` (c, N, 3) without and with ``forces`` (c, K, 3)."""
+        free = self.problem.residual(velocities, self.tensions)
+        return free, free - self.problem.dt * self.contacts.nodal_forces(forces)
+
+    def residual_norms(self, rest: torch.Tensor) -> torch.Tensor:
+        """Return (c,), the norms of the residuals ``rest`` (c, N, 3), divided by dt x weight."""
+        return rest.flatten(1).norm(dim=1) / self.problem.residual_scale
+
+
+@dataclass(frozen=True)
+class NewtonStepEnd(BatchedRecord):
+    """End of a full Newton step of c worlds."""
+
+    velocities: torch.Tensor
+    """(c, N, 3) m/s."""
+    forces: torch.Tensor
+    """(c, K, 3) newtons, those that satisfy Coulomb's law at the contact-free velocities."""
+    coulomb_violation: torch.Tensor
+    """(c,) m/s, their violation of the law."""
 
 
 @dataclass(frozen=True)
@@ -73,161 +105,133 @@ class BatchResult(BatchedRecord):
 
 
 @dataclass(frozen=True)
-class BatchSolver:
+class BatchSolver(NewtonOptions):
     """``CoupledSolver`` for many worlds."""
 
-    detector: ContactDetector
-    points: ContactSelector
-    push_out_cap: float
-    """Maximum push-out speed, m/s."""
-    penetration_tolerance: float
-    """Depth up to which a point is not pushed out, m."""
-    tolerance: float
-    """Residual divided by dt x weight at which a world has converged."""
     stages: StageTimer = no_timer
 
-    def normal_bias(self, contacts: ContactSet, dt: float) -> torch.Tensor:
-        """Return (c, K) m/s, the velocity bias of ``push_out_speeds``."""
-        slop = self.penetration_tolerance
-        return push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT_FRACTION, slop) * contacts.valid
-
     def linearize(
-        self, problem: BatchProblem, contacts: ContactSet, momentum_projection: BatchMomentumProjection | None = None
+        self, problem: BatchProblem, contacts: ContactSet, momentum_projection: MomentumProjection | None = None
     ) -> BatchLinearization:
         """Linearise ``contacts`` with the tangents in the worlds' slots; the momentum projection is computed unless it
         is passed.
         """
         with self.stages("substitute"):
-            columns, momentum_projection = apply_inverse(
-                problem, problem.dt * contacts.jacobian_transposed(), momentum_projection
-            )
-        delassus = contacts.contact_velocities(columns)
-        diagonal = delassus.diagonal(dim1=1, dim2=2)
-        mean = diagonal.sum(dim=1, keepdim=True) / (3 * contacts.counts[:, None]).clamp(min=1)
-        diagonal += DELASSUS_REGULARIZATION * mean
+            impulses = problem.dt * contacts.jacobian_transposed()
+            columns, momentum_projection = apply_inverse(problem, impulses, momentum_projection)
+        delassus = regularized(contacts.contact_velocities(columns), DELASSUS_REGULARIZATION, contacts.counts)
         return BatchLinearization(momentum_projection, columns, delassus)
 
-    def solve_coulomb(
+    def newton_step(
         self,
-        contacts: ContactSet,
+        inputs: BatchInputs,
         response: BatchLinearization,
-        free: torch.Tensor,
-        shift: torch.Tensor,
-        frictions: torch.Tensor,
-        start: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Solve Coulomb's law and complementarity for the contact forces.
+        velocities: torch.Tensor,
+        residual: torch.Tensor,
+        forces: torch.Tensor,
+    ) -> NewtonStepEnd:
+        """Take a full Newton step in c worlds, with the contact forces that satisfy Coulomb's law at the velocities
+        that it would reach without them.
 
         Args:
-            contacts: contacts of c worlds.
-            response: their linearisation.
-            free: (c, N, 3) m/s, nodal velocities without contact forces.
-            shift: (c, K) m/s, bias of the normal velocities.
-            frictions: (c,) Coulomb coefficients.
-            start: (c, K, 3) newtons, initial forces.
-
-        Returns:
-            (c, K, 3) newtons, and their violation of the law (c,) in m/s.
+            inputs: inputs of the worlds.
+            response: linearisation of their contacts.
+            velocities: (c, N, 3) m/s, at the start.
+            residual: (c, N, 3) N s, residual there without contact forces.
+            forces: (c, K, 3) newtons, initial forces of the Coulomb solve.
         """
+        contacts = inputs.contacts
+        with self.stages("substitute"):
+            solved, _ = apply_inverse(inputs.problem, residual.flatten(1)[:, :, None], response.momentum_projection)
+        free = velocities - solved.view_as(velocities)
         with self.stages("coulomb"):
             speeds = contacts.contact_velocities(free.flatten(1))
-            return coulomb_forces_batch(contacts.counts, response.delassus, speeds, shift, frictions, start)
+            operands = response.delassus, speeds, inputs.normal_bias, inputs.frictions, forces
+            target_forces, violation = coulomb_forces_of_worlds(contacts.counts, *operands)
+        force_velocities = (response.columns @ target_forces.flatten(1)[:, :, None]).view_as(free)
+        return NewtonStepEnd(free + force_velocities, target_forces, violation)
 
     def solve(
-        self,
-        problem: BatchProblem,
-        contacts: ContactSet,
-        response: BatchLinearization,
-        tensions: torch.Tensor,
-        frictions: torch.Tensor,
-        *,
-        velocities: torch.Tensor,
-        forces: torch.Tensor,
-        start_gaps: tuple[torch.Tensor, torch.Tensor],
+        self, inputs: BatchInputs, response: BatchLinearization, *, velocities: torch.Tensor, forces: torch.Tensor
     ) -> tuple[ContactSet, BatchResult]:
         """Solve the steps with Newton's method.
 
         Args:
-            problem: the steps of c worlds.
-            contacts: initial contacts.
-            response: their linearisation.
-            tensions: (c, M) newtons, muscle tensions.
-            frictions: (c,) Coulomb coefficients.
+            inputs: the steps of c worlds, with their initial contacts.
+            response: linearisation of these contacts.
             velocities: (c, N, 3) m/s, initial velocities.
             forces: (c, K, 3) newtons, initial forces.
-            start_gaps: (c, P) m, gaps at the start of the step, and (c, P), their faces.
 
         Returns:
             The contacts at the end, and the result.
         """
-        count = len(velocities)
-        result = BatchResult(
-            velocities.clone(),
-            forces.clone(),
-            torch.zeros(count, dtype=torch.bool, device=velocities.device),
-            torch.zeros(count, dtype=torch.int64, device=velocities.device),
-            *torch.zeros((2, count), dtype=torch.bool, device=velocities.device),
-        )
+        problem, contacts, count = inputs.problem, inputs.contacts, len(velocities)
+        flags = torch.zeros((3, count), dtype=torch.bool, device=velocities.device)
+        iterations = torch.zeros(count, dtype=torch.int64, device=velocities.device)
+        result = BatchResult(velocities.clone(), forces.clone(), flags[0], iterations, *flags[1:])
         todo = all_worlds = torch.arange(count, device=velocities.device)
         for number in range(MAX_ACTIVATION_ROUNDS):
-            part, active_contacts = problem.subset(todo), contacts.subset(todo)
-            shift, gaps = self.normal_bias(active_contacts, problem.dt), start_gaps[0][todo]
-            task = _RoundInputs(part, active_contacts, shift, tensions[todo], frictions[todo], gaps)
+            active = contacts.subset(todo)
+            bias = self.normal_bias(active, problem.dt)
+            part = replace(inputs.subset(todo), contacts=active, normal_bias=bias)
             last = number == MAX_ACTIVATION_ROUNDS - 1
-            done, left = self._round(task, response, result.velocities[todo], result.forces[todo], last=last)
+            done, left = self._round(part, response, result.velocities[todo], result.forces[todo], last=last)
             done = replace(done, iterations=done.iterations + result.iterations[todo])
             result.scatter(todo, done)
             if last:
                 break
             with self.stages("detect"):
-                added, ends = self._points_to_add(task, done.velocities)
+                added, ends = self._points_to_add(part, done.velocities)
             more = nonzero((added >= 0).any(dim=1) & (done.converged | done.contacts_added))
             if len(more) == 0:
                 break
-            positions, *gaps_there = (each[todo[more]] for each in (problem.positions, *start_gaps))
-            points, counts = self.points.append_in_worlds(active_contacts.gather(more), added[more], ends[more])
-            grown = self.detector.contact_sets(points, counts, positions, gaps_there)
+            points, counts = self.points.append_in_worlds(active.gather(more), added[more], ends[more])
+            grown = part.gather(more)
+            start = grown.start_gaps, grown.start_faces
+            grown = self.detector.contact_sets(points, counts, grown.problem.state.positions, start)
             grown = grown.with_capacity(max(grown.capacity, contacts.capacity))
             extra = grown.capacity - contacts.capacity
-            forces = padded(done.forces[more], extra)
             # Copy, since the caller's contacts must not change.
             contacts = contacts.with_capacity(grown.capacity).gather(all_worlds)
             result = replace(result, forces=padded(result.forces, extra))
             todo = todo[more]
             contacts.scatter(todo, grown)
-            result.forces[todo] = forces
+            result.forces[todo] = padded(done.forces[more], extra)
             response = self.linearize(problem.subset(todo), grown, left.momentum_projection.gather(more))
         return contacts, result
 
-    def _points_to_add(self, task: _RoundInputs, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _points_to_add(self, inputs: BatchInputs, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (c, C), the points of each cell that would be too deep at the end of the step with ``velocities`` (c,
         N, 3), or -1, and (c, P) m, all gaps at the end.
         """
-        gaps, _ = self.detector.gaps_of_worlds(task.problem.end_positions(velocities))
+        gaps, _ = self.detector.gaps_of_worlds(inputs.problem.end_positions(velocities))
         tolerance = self.penetration_tolerance
-        return self.points.find_penetrating_in_worlds(task.contacts, (gaps, task.start_gaps), tolerance), gaps
+        return self.points.find_penetrating_in_worlds(inputs.contacts, (gaps, inputs.start_gaps), tolerance), gaps
 
     def _round(
         self,
-        task: _RoundInputs,
+        inputs: BatchInputs,
         response: BatchLinearization,
         velocities: torch.Tensor,
         forces: torch.Tensor,
         *,
         last: bool,
     ) -> tuple[BatchResult, BatchLinearization]:
-        """Run Newton's method with the contacts of ``task`` until points must be added, which never happens in the
+        """Run Newton's method with the contacts of ``inputs`` until points must be added, which never happens in the
         ``last`` round. Return the result and the last linearisations.
         """
         with self.stages("elasticity"):
-            free, size = task.contact_free_residual(velocities, forces)
-        state = _NewtonState.begin(velocities, forces, free, self._progress(task.problem, size, last=last))
+            free, rest = inputs.residuals(velocities, forces)
+        row = self.progress(inputs.problem, last=last).row
+        progress = torch.as_tensor(row, device=free.device).repeat(len(free), 1)
+        progress[:, rule.RESIDUAL] = inputs.residual_norms(rest)
+        state = _NewtonState.begin(velocities, forces, free, progress)
         for _ in range(MAX_NEWTON_STEPS):
             active = nonzero(state.active)
             if len(active) == 0:
                 break
-            part, search = task.subset(active), state.subset(active)
-            self._newton_step(part, search, response.subset(active))
+            part, search = inputs.subset(active), state.subset(active)
+            self._search_line(part, search, response.subset(active))
             search.active.copy_(~search.had(rule.ENDED | rule.FAILED))
             to_check = nonzero(search.had(rule.NEAR_END) & ~search.had(rule.ENDED))
             if len(to_check) > 0:
@@ -253,44 +257,29 @@ class BatchSolver:
         )
         return BatchResult(*ends), response
 
-    def _progress(self, problem: BatchProblem, size: torch.Tensor, *, last: bool) -> torch.Tensor:
-        """Return (c, ROW_SIZE), the progress at the start of a round with residuals ``size`` (c,)."""
-        coulomb_tolerance = COULOMB_TOLERANCE * problem.residual_scale / problem.body.body.mass
-        first = NewtonProgress(self.tolerance, -1.0 if last else ACTIVATION_RESIDUAL, coulomb_tolerance)
-        progress = torch.as_tensor(first.row, device=size.device).repeat(len(size), 1)
-        progress[:, rule.RESIDUAL] = size
-        return progress
-
-    def _check_penetration(self, task: _RoundInputs, search: _NewtonState, rows: torch.Tensor) -> None:
-        """Find points to add in the worlds of ``task``, which are the rows ``rows`` of ``search``, and end the round of
-        worlds in which there are some.
+    def _check_penetration(self, inputs: BatchInputs, search: _NewtonState, rows: torch.Tensor) -> None:
+        """Find points to add in the worlds of ``inputs``, which are the rows ``rows`` of ``search``, and end the round
+        of worlds in which there are some.
         """
         with self.stages("detect"):
-            added, _ = self._points_to_add(task, search.velocities[rows])
+            added, _ = self._points_to_add(inputs, search.velocities[rows])
         joined = (added >= 0).any(dim=1)
         search.contacts_added[rows], search.active[rows] = joined, ~joined
 
-    def _newton_step(self, task: _RoundInputs, search: _NewtonState, response: BatchLinearization) -> None:
-        """Take one Newton step in each world of ``search``, in place."""
-        problem = task.problem
-        with self.stages("substitute"):
-            solved, _ = apply_inverse(
-                problem, search.contact_free_residual.flatten(1)[:, :, None], response.momentum_projection
-            )
-        free_velocities = search.velocities - solved.view_as(search.velocities)
-        target_forces, violation = self.solve_coulomb(
-            task.contacts, response, free_velocities, task.normal_bias, task.frictions, search.forces
-        )
-        force_velocities = (response.columns @ target_forces.flatten(1)[:, :, None]).view_as(free_velocities)
-        change, force_change = free_velocities + force_velocities - search.velocities, target_forces - search.forces
-        waiting, length = torch.arange(len(violation), device=violation.device), 1.0
+    def _search_line(self, inputs: BatchInputs, search: _NewtonState, response: BatchLinearization) -> None:
+        """Take one Newton step in each world of ``search``, shortened until it is accepted, in place."""
+        start = search.velocities, search.contact_free_residual, search.forces
+        end = self.newton_step(inputs, response, *start)
+        change, force_change = end.velocities - search.velocities, end.forces - search.forces
+        waiting, length = torch.arange(len(change), device=change.device), 1.0
         while len(waiting) > 0:
             trial = search.velocities[waiting] + length * change[waiting]
             trial_forces = search.forces[waiting] + length * force_change[waiting]
+            part = inputs.subset(waiting)
             with self.stages("elasticity"):
-                free, size = task.subset(waiting).contact_free_residual(trial, trial_forces)
+                free, rest = part.residuals(trial, trial_forces)
             progress = search.progress[waiting]
-            _judge(progress, size, violation[waiting])
+            _judge(progress, part.residual_norms(rest), end.coulomb_violation[waiting])
             search.progress[waiting] = progress
             good = has_outcome(progress, rule.ACCEPTED)
             at = waiting[good]
@@ -314,33 +303,6 @@ def _judge(progress: torch.Tensor, sizes: torch.Tensor, violations: torch.Tensor
 def has_outcome(progress: torch.Tensor, bits: int) -> torch.Tensor:
     """Return (c,) bool, True for worlds whose last trial had any of ``bits``; ``progress`` is (c, ROW_SIZE)."""
     return (progress[:, rule.OUTCOME].long() & bits) > 0
-
-
-@dataclass(frozen=True)
-class _RoundInputs(BatchedRecord):
-    """Inputs of a round of c worlds."""
-
-    problem: BatchProblem
-    contacts: ContactSet
-    normal_bias: torch.Tensor
-    """(c, K) m/s."""
-    tensions: torch.Tensor
-    """(c, M) newtons."""
-    frictions: torch.Tensor
-    """(c,) Coulomb coefficients."""
-    start_gaps: torch.Tensor
-    """(c, P) m, gaps at the start of the step."""
-
-    def contact_free_residual(
-        self, velocities: torch.Tensor, forces: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (c, N, 3) N s, the residual without contact forces at ``velocities`` (c, N, 3), and (c,) the norm of
-        the residual with ``forces`` (c, K, 3), divided by dt x weight.
-        """
-        problem = self.problem
-        free = problem.residual(velocities, self.tensions)
-        rest = free - problem.dt * self.contacts.nodal_forces(forces)
-        return free, rest.flatten(1).norm(dim=1) / problem.residual_scale
 
 
 @dataclass(frozen=True)

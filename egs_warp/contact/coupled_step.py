@@ -9,6 +9,7 @@ or ``device_newton`` (GPU).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from egs_warp.contact.detection import ContactDetector
 from egs_warp.contact.newton import ContactLinearization, NewtonIterate, PenetrationCheck
 from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
 from egs_warp.contact.selection import ACTIVATION_DEPTH, ContactSelector
+from egs_warp.fem.implicit_step import ImplicitStep
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.kernels.contact.newton_convergence import ACCEPTED, ENDED, FAILED, NEAR_END, NEEDS_TANGENT, SHORTEN
 from egs_warp.muscles.tension import MuscleEnergy
@@ -55,8 +57,10 @@ class CoupledResult:
 
 
 @dataclass(frozen=True)
-class CoupledSolver:
-    """Newton's method on velocities and contact forces together."""
+class NewtonOptions:
+    """Tolerances of Newton's method on velocities and contact forces, in one world or in many, and the objects that
+    detect and select contacts.
+    """
 
     detector: ContactDetector
     points: ContactSelector
@@ -67,25 +71,32 @@ class CoupledSolver:
     tolerance: float = 1e-8
     """Residual divided by dt x weight at which the solve ends."""
 
-    def normal_bias(self, contacts: ContactSet, dt: float) -> np.ndarray:
+    def normal_bias(self, contacts: ContactSet, dt: float) -> Any:
         """Return the velocity bias added to each contact's normal velocity.
 
         It forbids further penetration during the step and pushes contacts that are deeper than
         ``penetration_tolerance`` out at a limited speed.
 
         Args:
-            contacts: n active contacts.
+            contacts: active contacts.
             dt: step size, s.
 
         Returns:
-            (n,) m/s.
+            (n,) m/s, or (B, K) with zeros as padding.
         """
-        return push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT_FRACTION, self.penetration_tolerance)
+        tolerance = self.penetration_tolerance
+        speeds = push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT_FRACTION, tolerance)
+        return speeds if contacts.counts is None else speeds * contacts.valid
 
-    def progress(self, problem: StepProblem, *, last: bool = False) -> NewtonProgress:
+    def progress(self, problem: ImplicitStep, *, last: bool = False) -> NewtonProgress:
         """Return the progress at the start of a round. In the ``last`` round no points are added."""
         coulomb_tolerance = COULOMB_TOLERANCE * problem.residual_scale / problem.body.mass
         return NewtonProgress(self.tolerance, -1.0 if last else ACTIVATION_RESIDUAL, coulomb_tolerance)
+
+
+@dataclass(frozen=True)
+class CoupledSolver(NewtonOptions):
+    """Newton's method on velocities and contact forces of one world."""
 
     def solve(
         self,

@@ -18,7 +18,8 @@ from egs_warp.contact.prefetch import ContactPrefetch
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
-from egs_warp.fem.step_problem import MIN_RELATIVE_STIFFNESS, StepProblem
+from egs_warp.fem.implicit_step import MIN_RELATIVE_STIFFNESS
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.fem.tiled_cholesky import TiledCholesky
 from egs_warp.fem.warp_elasticity import WarpElasticity
 from egs_warp.kernels.fem import step_start as kernels

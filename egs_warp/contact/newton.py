@@ -15,17 +15,12 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from egs_warp.contact.contact_set import ContactSet
-from egs_warp.contact.coulomb import coulomb_forces
+from egs_warp.contact.coulomb import DELASSUS_REGULARIZATION, coulomb_forces, regularized
 from egs_warp.contact.host_newton import HostNewtonWorkspace, IterateBuffer, address_of, host_newton_workspace
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.muscles.tension import MuscleEnergy
-
-DELASSUS_REGULARIZATION = 1e-7
-"""Diagonal shift of the Delassus operator, as a fraction of the mean of its diagonal. The operator is singular if there
-are more points than the cage can resolve.
-"""
 
 
 @dataclass(frozen=True)
@@ -57,9 +52,7 @@ class ContactLinearization:
 
     @cached_property
     def _regular(self) -> np.ndarray:
-        regular = self.delassus.copy()
-        regular[np.diag_indices_from(regular)] += DELASSUS_REGULARIZATION * regular.diagonal().mean()
-        return regular
+        return regularized(self.delassus, DELASSUS_REGULARIZATION)
 
     def solve_coulomb(
         self, speeds: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray

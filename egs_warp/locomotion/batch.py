@@ -12,9 +12,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 
-from egs_warp.contact.batch_step import BatchLinearization, BatchResult, BatchSolver, StageTimer, no_timer
+from egs_warp.contact.batch_step import BatchInputs, BatchLinearization, BatchResult, BatchSolver, StageTimer, no_timer
 from egs_warp.contact.contact_set import ContactSet
-from egs_warp.contact.coupled_step import CoupledSolver
 from egs_warp.contact.detection import ContactDetector, ContactGeometry
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batch_problem import BatchBody, BatchProblem, apply_inverse
@@ -148,7 +147,6 @@ class BatchStepper:
             self.selector,
             push_out_cap=self.settings.push_out_cap * body.speed_unit,
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
-            tolerance=CoupledSolver.tolerance,
             stages=stages,
         )
         self._stages = stages
@@ -209,17 +207,12 @@ class BatchStepper:
             The state; (c,) m, largest displacement of a node along an axis; and (c,) bool, True where a tangent was not
             positive definite.
         """
-        problem = self._problem(state, dt, 0.0)
-        contacts, previous_forces, start_gaps = self._detect(problem, state)
-        velocities = problem.rigid_guess
+        tensions = self._stiffness.new_zeros((len(state.worlds), len(self._stiffness)))
+        inputs, previous_forces = self._start(state, tensions, dt, 0.0)
+        problem, velocities = inputs.problem, inputs.problem.rigid_guess
         failed = ~problem.factor(velocities, None)
-        contacts, result = self.solver.solve(
-            *(problem, contacts, self.solver.linearize(problem, contacts)),
-            *(self._stiffness.new_zeros((len(velocities), len(self._stiffness))), self._frictions[state.worlds]),
-            velocities=velocities,
-            forces=previous_forces,
-            start_gaps=start_gaps,
-        )
+        response = self.solver.linearize(problem, inputs.contacts)
+        contacts, result = self.solver.solve(inputs, response, velocities=velocities, forces=previous_forces)
         after = BatchState(
             *(state.worlds, problem.end_positions(result.velocities), torch.zeros_like(velocities), state.time),
             *(contacts.points, contacts.counts, result.forces),
@@ -282,43 +275,33 @@ class BatchStepper:
     def _step(self, state: BatchState, activations: torch.Tensor, dt: float) -> tuple[BatchStep, torch.Tensor]:
         """Make one step of all worlds, as ``LocomotionStepper.step_with_activations`` does; also return (c,) bool, True
         where a tangent was not positive definite."""
-        frictions, tensions = self._frictions[state.worlds], self._stiffness * activations
         with self._stages("detect"):
-            problem = self._problem(state, dt, self.settings.drag)
-            contacts, previous_forces, start_gaps = self._detect(problem, state)
-        response, velocities, forces, failed = self._predict(problem, contacts, previous_forces, tensions, frictions)
-        contacts, result = self.solver.solve(
-            *(problem, contacts, response, tensions, frictions),
-            velocities=velocities,
-            forces=forces,
-            start_gaps=start_gaps,
-        )
-        step = self._finish(problem, contacts, result, state, activations)
+            inputs, previous_forces = self._start(state, self._stiffness * activations, dt, self.settings.drag)
+        response, velocities, forces, failed = self._predict(inputs, previous_forces)
+        contacts, result = self.solver.solve(inputs, response, velocities=velocities, forces=forces)
+        step = self._finish(inputs, contacts, result, state, activations)
         failed |= result.is_singular
         return replace(step, converged=step.converged & ~failed), failed
 
-    def _problem(self, state: BatchState, dt: float, drag: float) -> BatchProblem:
-        return BatchProblem.at(self.common, state.worlds, state.positions, state.velocities, dt=dt, drag=drag)
+    def _start(
+        self, state: BatchState, tensions: torch.Tensor, dt: float, drag: float
+    ) -> tuple[BatchInputs, torch.Tensor]:
+        """Detect the contacts of a step of ``dt`` seconds under muscle ``tensions`` (c, M) N.
 
-    def _detect(
-        self, problem: BatchProblem, state: BatchState
-    ) -> tuple[ContactSet, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-        """Return the contacts, their forces (c, K, 3) N in the previous step, and gaps and faces at the start."""
-        ballistic = state.velocities + problem.dt * self.common.gravity
-        gaps, _ = self.detector.gaps_of_worlds(problem.end_positions(ballistic))
+        Returns:
+            Inputs of the solve, and (c, K, 3) N, the forces of the contacts in the previous step.
+        """
+        problem = BatchProblem.at(self.common, state.worlds, state.positions, state.velocities, dt=dt, drag=drag)
+        gaps, _ = self.detector.gaps_of_worlds(problem.ballistic_positions)
         previous = state.points, state.counts, (state.forces[:, :, 0] > 0.0).int()
-        chosen = self.selector.select_in_worlds(previous, gaps)
-        start_gaps = self.detector.gaps_of_worlds(state.positions)
-        contacts = self.detector.contact_sets(*chosen, state.positions, start_gaps)
-        return contacts, contacts.transferred_forces(state.points, state.forces, state.counts), start_gaps
+        start = self.detector.gaps_of_worlds(state.positions)
+        contacts = self.detector.contact_sets(*self.selector.select_in_worlds(previous, gaps), state.positions, start)
+        bias, frictions = self.solver.normal_bias(contacts, dt), self._frictions[state.worlds]
+        inputs = BatchInputs(problem, contacts, bias, tensions, frictions, *start)
+        return inputs, contacts.transferred_forces(state.points, state.forces, state.counts)
 
     def _predict(
-        self,
-        problem: BatchProblem,
-        contacts: ContactSet,
-        previous_forces: torch.Tensor,
-        tensions: torch.Tensor,
-        frictions: torch.Tensor,
+        self, inputs: BatchInputs, previous_forces: torch.Tensor
     ) -> tuple[BatchLinearization, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Predict the end of the step in all worlds, as ``LocomotionStepper.predict`` does.
 
@@ -326,13 +309,12 @@ class BatchStepper:
             Contact linearisation, velocities (c, N, 3) m/s, forces (c, K, 3) N, and (c,) bool, True where a tangent was
             not positive definite.
         """
-        solver, stages = self.solver, self._stages
-        velocities, bias = problem.rigid_guess.clone(), solver.normal_bias(contacts, problem.dt)
+        solver, stages, problem = self.solver, self._stages, inputs.problem
+        velocities = problem.rigid_guess.clone()
         with stages("factor"):
             failed = ~problem.factor(velocities, None)
         with stages("elasticity"):
-            residual = problem.residual(velocities, tensions)
-        residual = residual - problem.dt * contacts.nodal_forces(previous_forces)
+            _, residual = inputs.residuals(velocities, previous_forces)
         with stages("substitute"):
             newton_step, _ = apply_inverse(problem, residual.flatten(1)[:, :, None])
         trial = velocities - newton_step.view_as(velocities)
@@ -341,43 +323,35 @@ class BatchStepper:
         if len(accepted) > 0:
             with stages("factor"):
                 failed[accepted] = ~problem.subset(accepted).factor(velocities[accepted], None)
-        response = solver.linearize(problem, contacts)
+        response = solver.linearize(problem, inputs.contacts)
         active, forces = nonzero(~failed), previous_forces.clone()
         for _ in range(PREDICTION_ITERATIONS):
             if len(active) == 0:
                 break
-            part, active_contacts, linearization = (
-                problem.subset(active),
-                contacts.subset(active),
-                response.subset(active),
-            )
+            part = inputs.subset(active)
             with stages("elasticity"):
-                residual = part.residual(velocities[active], tensions[active])
-            with stages("substitute"):
-                newton_step, _ = apply_inverse(part, residual.flatten(1)[:, :, None], linearization.momentum_projection)
-            free = velocities[active] - newton_step.view_as(residual)
-            contact_forces, _ = solver.solve_coulomb(
-                active_contacts, linearization, free, bias[active], frictions[active], previous_forces[active]
-            )
-            trial = free + (linearization.columns @ contact_forces.flatten(1)[:, :, None]).view_as(free)
-            solved = part.is_inversion_free(trial)
-            forces[active] = contact_forces
+                residual = part.problem.residual(velocities[active], part.tensions)
+            start = velocities[active], residual, previous_forces[active]
+            end = solver.newton_step(part, response.subset(active), *start)
+            forces[active] = end.forces
+            solved = part.problem.is_inversion_free(end.velocities)
             active = active[solved]
-            velocities[active], previous_forces[active] = trial[solved], contact_forces[solved]
+            velocities[active], previous_forces[active] = end.velocities[solved], end.forces[solved]
         return response, velocities, forces, failed
 
     def _finish(
         self,
-        problem: BatchProblem,
+        inputs: BatchInputs,
         contacts: ContactSet,
         result: BatchResult,
         state: BatchState,
         activations: torch.Tensor,
     ) -> BatchStep:
+        problem = inputs.problem
         end = problem.end_positions(result.velocities)
         with self._stages("detect"):
             gaps, _ = self.detector.gaps_of_worlds(end)
-        internal = problem.internal_gradient(result.velocities, self._stiffness * activations)
+        internal = problem.internal_gradient(result.velocities, inputs.tensions)
         after = BatchState(
             *(state.worlds, end, result.velocities, state.time + problem.dt),
             *(contacts.points, contacts.counts, result.forces),

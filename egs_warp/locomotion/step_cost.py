@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from egs_warp.contact.contact_set import ContactSet
+from egs_warp.fem.implicit_step import UnsolvableStepError
 from egs_warp.fem.linear_solver import FactorStatus, LinearSolver
-from egs_warp.fem.step_problem import StepProblem, UnsolvableStepError
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.linear_step import LinearStep
 from egs_warp.locomotion.objectives import AnyObjective, Objective
 

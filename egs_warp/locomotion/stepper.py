@@ -428,8 +428,7 @@ class LocomotionStepper:
         contacts = self.linearizer.select_contacts(problem, memory.points, loaded)
         if contacts is not None:
             return contacts
-        ballistic = problem.state.velocities + problem.dt * self.body.gravity
-        gaps, _ = self.detector.gaps(problem.end_positions(ballistic))
+        gaps, _ = self.detector.gaps(problem.ballistic_positions)
         return self.detector.contact_set(self.selector.select(memory.points, loaded, gaps), problem.state.positions)
 
     def predict(self, start: StepInputs) -> PredictedStep:

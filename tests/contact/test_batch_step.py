@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from egs_warp.contact.batch_step import BatchResult, BatchSolver
+from egs_warp.contact.batch_step import BatchInputs, BatchResult, BatchSolver
 from egs_warp.contact.contact_set import ContactSet, push_out_speeds
 from egs_warp.contact.coupled_step import ContactLinearization, CoupledResult, CoupledSolver
 from egs_warp.contact.detection import ContactDetector
@@ -90,7 +90,7 @@ def solved_together(
     common = BatchBody(creature.body, creature.muscles, count)
     problem = BatchProblem.at(common, torch.arange(count), positions, velocities, dt=dt, drag=DRAG)
     begun = detector.gaps_of_worlds(positions)
-    ends, _ = detector.gaps_of_worlds(problem.end_positions(velocities + dt * common.gravity))
+    ends, _ = detector.gaps_of_worlds(problem.ballistic_positions)
     near = [lowest_points(one.points, gaps.numpy()) for gaps in ends]
     near = [each[each % 3 == 0] if few else each for each in near]
     counts = torch.tensor([len(each) for each in near], dtype=torch.int32)
@@ -99,13 +99,12 @@ def solved_together(
         row[: len(each)] = torch.from_numpy(each)
     contacts = detector.contact_sets(points, counts, positions, begun)
     assert problem.factor(problem.rigid_guess, None).all()
-    touched, made = beside.solve(
-        *(problem, contacts, beside.linearize(problem, contacts)),
-        *(torch.from_numpy(creature.muscles.stiffness * activations), torch.tensor(FRICTIONS, dtype=torch.float64)),
-        velocities=problem.rigid_guess,
-        forces=torch.zeros((count, contacts.capacity, 3), dtype=torch.float64),
-        start_gaps=begun,
-    )
+    tensions = torch.from_numpy(creature.muscles.stiffness * activations)
+    frictions = torch.tensor(FRICTIONS, dtype=torch.float64)
+    inputs = BatchInputs(problem, contacts, beside.normal_bias(contacts, dt), tensions, frictions, *begun)
+    forces = torch.zeros((count, contacts.capacity, 3), dtype=torch.float64)
+    response = beside.linearize(problem, contacts)
+    touched, made = beside.solve(inputs, response, velocities=problem.rigid_guess, forces=forces)
     assert torch.equal(contacts.counts, counts)
     return contacts, touched, made
 

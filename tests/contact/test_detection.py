@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.contact_set import push_out_speeds
+from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.detection import (
     ContactDetector,
     _hull_points,

@@ -40,7 +40,7 @@ class PassiveBody:
         """Advance one step of ``dt`` s."""
         body, state, solver = self.body, self.state, self.solver
         problem = StepProblem(body, state, dt, drag)
-        gaps, _ = solver.detector.gaps(problem.end_positions(state.velocities + dt * body.gravity))
+        gaps, _ = solver.detector.gaps(problem.ballistic_positions)
         chosen = solver.points.select(self.points, self.forces[:, 0] > 0.0, gaps)
         contacts = solver.detector.contact_set(chosen, state.positions)
         tangent = problem.tangent(self.factors, problem.rigid_guess, tension)
