@@ -16,6 +16,7 @@ from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coulomb import DELASSUS_REGULARIZATION, coulomb_forces_of_worlds, regularized
 from egs_warp.contact.coupled_step import MAX_ACTIVATION_ROUNDS, NewtonOptions
 from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS
+from egs_warp.contact.newton_round import run_round
 from egs_warp.fem.batch_problem import BatchProblem, apply_inverse
 from egs_warp.fem.batched import BatchedRecord, launch_on, nonzero, padded
 from egs_warp.fem.momentum_projection import MomentumProjection
@@ -175,13 +176,15 @@ class BatchSolver(NewtonOptions):
             bias = self.normal_bias(active, problem.dt)
             part = replace(inputs.subset(todo), contacts=active, normal_bias=bias)
             last = number == MAX_ACTIVATION_ROUNDS - 1
-            done, left = self._round(part, response, result.velocities[todo], result.forces[todo], last=last)
+            newton = _BatchRound(self, part, response, result.velocities[todo], result.forces[todo], last=last)
+            run_round(newton)
+            done = newton.result()
             done = replace(done, iterations=done.iterations + result.iterations[todo])
             result.scatter(todo, done)
             if last:
                 break
             with self.stages("detect"):
-                added, ends = self._points_to_add(part, done.velocities)
+                added, ends = self.points_to_add(part, done.velocities)
             more = nonzero((added >= 0).any(dim=1) & (done.converged | done.contacts_added))
             if len(more) == 0:
                 break
@@ -197,10 +200,10 @@ class BatchSolver(NewtonOptions):
             todo = todo[more]
             contacts.scatter(todo, grown)
             result.forces[todo] = padded(done.forces[more], extra)
-            response = self.linearize(problem.subset(todo), grown, left.momentum_projection.gather(more))
+            response = self.linearize(problem.subset(todo), grown, newton.response.momentum_projection.gather(more))
         return contacts, result
 
-    def _points_to_add(self, inputs: BatchInputs, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def points_to_add(self, inputs: BatchInputs, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (c, C), the points of each cell that would be too deep at the end of the step with ``velocities`` (c,
         N, 3), or -1, and (c, P) m, all gaps at the end.
         """
@@ -208,84 +211,92 @@ class BatchSolver(NewtonOptions):
         tolerance = self.penetration_tolerance
         return self.points.find_penetrating_in_worlds(inputs.contacts, (gaps, inputs.start_gaps), tolerance), gaps
 
-    def _round(
+
+class _BatchRound:
+    """``NewtonWorlds`` of c worlds; a set of worlds is a tensor of ascending indices."""
+
+    def __init__(
         self,
+        solver: BatchSolver,
         inputs: BatchInputs,
         response: BatchLinearization,
         velocities: torch.Tensor,
         forces: torch.Tensor,
         *,
         last: bool,
-    ) -> tuple[BatchResult, BatchLinearization]:
-        """Run Newton's method with the contacts of ``inputs`` until points must be added, which never happens in the
-        ``last`` round. Return the result and the last linearisations.
+    ) -> None:
+        """Start a round, in which no points are added if it is the ``last``. ``velocities`` (c, N, 3) m/s and
+        ``forces`` (c, K, 3) newtons are updated in place, and so is ``response``, the linearisation.
         """
-        with self.stages("elasticity"):
-            free, rest = inputs.residuals(velocities, forces)
-        row = self.progress(inputs.problem, last=last).row
-        progress = torch.as_tensor(row, device=free.device).repeat(len(free), 1)
-        progress[:, rule.RESIDUAL] = inputs.residual_norms(rest)
-        state = _NewtonState.begin(velocities, forces, free, progress)
-        for _ in range(MAX_NEWTON_STEPS):
-            active = nonzero(state.active)
-            if len(active) == 0:
-                break
-            part, search = inputs.subset(active), state.subset(active)
-            self._search_line(part, search, response.subset(active))
-            search.active.copy_(~search.had(rule.ENDED | rule.FAILED))
-            to_check = nonzero(search.had(rule.NEAR_END) & ~search.had(rule.ENDED))
-            if len(to_check) > 0:
-                self._check_penetration(part.subset(to_check), search, to_check)
-            fresh = nonzero(search.had(rule.NEEDS_TANGENT) & search.active)
-            if len(fresh) > 0:
-                again = part.subset(fresh)
-                with self.stages("factor"):
-                    factored = again.problem.factor(search.velocities[fresh], again.tensions)
-                response.scatter(active[fresh], self.linearize(again.problem, again.contacts))
-                search.progress[fresh, rule.TANGENT_IS_CURRENT] = 1.0
-                search.is_singular[fresh] = ~factored
-                search.active[fresh] = factored
-            if search is not state:
-                state.scatter(active, search)
-        ends = (
-            state.velocities,
-            state.forces,
-            state.had(rule.ENDED),
-            state.progress[:, rule.STEPS].long(),
-            state.is_singular,
-            state.contacts_added,
+        self._solver, self._inputs, self.response = solver, inputs, response
+        self._velocities, self._forces = velocities, forces
+        with solver.stages("elasticity"):
+            self._free_residual, rest = inputs.residuals(velocities, forces)
+        row = solver.progress(inputs.problem, last=last).row
+        self._progress = torch.as_tensor(row, device=rest.device).repeat(len(rest), 1)
+        self._progress[:, rule.RESIDUAL] = inputs.residual_norms(rest)
+        flags = torch.zeros((3, len(rest)), dtype=torch.bool, device=rest.device)
+        self._is_active, self._is_singular, self._contacts_added = ~flags[0], *flags[1:]
+        self._end = NewtonStepEnd(*map(torch.empty_like, (velocities, forces, self._progress[:, 0])))
+
+    def result(self) -> BatchResult:
+        """Return the result of the round."""
+        ended, steps = has_outcome(self._progress, rule.ENDED), self._progress[:, rule.STEPS].long()
+        return BatchResult(self._velocities, self._forces, ended, steps, self._is_singular, self._contacts_added)
+
+    def running(self) -> torch.Tensor:
+        """Return the active worlds that have steps left."""
+        return nonzero(self._is_active & (self._progress[:, rule.STEPS] < MAX_NEWTON_STEPS))
+
+    def active(self, bits: int) -> torch.Tensor:
+        """Return the active worlds whose last trial had any of ``bits`` as its outcome."""
+        return nonzero(self._is_active & has_outcome(self._progress, bits))
+
+    def take_step(self, worlds: torch.Tensor) -> None:
+        """Judge the trials at the ends of full Newton steps."""
+        part = self._inputs.subset(worlds)
+        start = self._velocities[worlds], self._free_residual[worlds], self._forces[worlds]
+        self._end.scatter(worlds, self._solver.newton_step(part, self.response.subset(worlds), *start))
+        self._try(worlds, part)
+
+    def halve_step(self, worlds: torch.Tensor) -> None:
+        """Judge the trials at the reduced lengths."""
+        self._try(worlds, self._inputs.subset(worlds))
+
+    def _try(self, worlds: torch.Tensor, part: BatchInputs) -> None:
+        progress, end = self._progress[worlds], self._end.gather(worlds)
+        length = progress[:, rule.LENGTH, None, None]
+        velocities, forces = (
+            start[worlds] + length * (target - start[worlds])
+            for start, target in ((self._velocities, end.velocities), (self._forces, end.forces))
         )
-        return BatchResult(*ends), response
+        with self._solver.stages("elasticity"):
+            free, rest = part.residuals(velocities, forces)
+        _judge(progress, part.residual_norms(rest), end.coulomb_violation)
+        self._progress[worlds] = progress
+        good = has_outcome(progress, rule.ACCEPTED)
+        at = worlds[good]
+        self._velocities[at], self._forces[at], self._free_residual[at] = velocities[good], forces[good], free[good]
 
-    def _check_penetration(self, inputs: BatchInputs, search: _NewtonState, rows: torch.Tensor) -> None:
-        """Find points to add in the worlds of ``inputs``, which are the rows ``rows`` of ``search``, and end the round
-        of worlds in which there are some.
-        """
-        with self.stages("detect"):
-            added, _ = self._points_to_add(inputs, search.velocities[rows])
-        joined = (added >= 0).any(dim=1)
-        search.contacts_added[rows], search.active[rows] = joined, ~joined
+    def stop(self, bits: int) -> None:
+        """End the round of the worlds whose last trial had any of ``bits`` as its outcome."""
+        self._is_active &= ~has_outcome(self._progress, bits)
 
-    def _search_line(self, inputs: BatchInputs, search: _NewtonState, response: BatchLinearization) -> None:
-        """Take one Newton step in each world of ``search``, shortened until it is accepted, in place."""
-        start = search.velocities, search.contact_free_residual, search.forces
-        end = self.newton_step(inputs, response, *start)
-        change, force_change = end.velocities - search.velocities, end.forces - search.forces
-        waiting, length = torch.arange(len(change), device=change.device), 1.0
-        while len(waiting) > 0:
-            trial = search.velocities[waiting] + length * change[waiting]
-            trial_forces = search.forces[waiting] + length * force_change[waiting]
-            part = inputs.subset(waiting)
-            with self.stages("elasticity"):
-                free, rest = part.residuals(trial, trial_forces)
-            progress = search.progress[waiting]
-            _judge(progress, part.residual_norms(rest), end.coulomb_violation[waiting])
-            search.progress[waiting] = progress
-            good = has_outcome(progress, rule.ACCEPTED)
-            at = waiting[good]
-            search.velocities[at], search.forces[at] = trial[good], trial_forces[good]
-            search.contact_free_residual[at] = free[good]
-            waiting, length = waiting[has_outcome(progress, rule.SHORTEN)], 0.5 * length
+    def check_penetration(self, worlds: torch.Tensor) -> None:
+        """End the round of those of the ``worlds`` in which points must be added to the contacts."""
+        with self._solver.stages("detect"):
+            added, _ = self._solver.points_to_add(self._inputs.subset(worlds), self._velocities[worlds])
+        self._contacts_added[worlds] = (added >= 0).any(dim=1)
+        self._is_active &= ~self._contacts_added
+
+    def renew_tangent(self, worlds: torch.Tensor) -> None:
+        """Factor and linearise the ``worlds`` at their velocities, and end the round of those without factors."""
+        part = self._inputs.subset(worlds)
+        with self._solver.stages("factor"):
+            factored = part.problem.factor(self._velocities[worlds], part.tensions)
+        self.response.scatter(worlds, self._solver.linearize(part.problem, part.contacts))
+        self._progress[worlds, rule.TANGENT_IS_CURRENT] = 1.0
+        self._is_singular[worlds], self._is_active[worlds] = ~factored, factored
 
 
 def _judge(progress: torch.Tensor, sizes: torch.Tensor, violations: torch.Tensor) -> None:
@@ -303,36 +314,3 @@ def _judge(progress: torch.Tensor, sizes: torch.Tensor, violations: torch.Tensor
 def has_outcome(progress: torch.Tensor, bits: int) -> torch.Tensor:
     """Return (c,) bool, True for worlds whose last trial had any of ``bits``; ``progress`` is (c, ROW_SIZE)."""
     return (progress[:, rule.OUTCOME].long() & bits) > 0
-
-
-@dataclass(frozen=True)
-class _NewtonState(BatchedRecord):
-    """State of Newton's method in c worlds, written in place."""
-
-    velocities: torch.Tensor
-    """(c, N, 3) m/s."""
-    forces: torch.Tensor
-    """(c, K, 3) newtons."""
-    contact_free_residual: torch.Tensor
-    """(c, N, 3) N s, residual without contact forces."""
-    progress: torch.Tensor
-    """(c, ROW_SIZE) progress of the round (``NewtonProgress``)."""
-    active: torch.Tensor
-    """(c,) bool, True while the world is being solved."""
-    is_singular: torch.Tensor
-    """(c,) bool, True if a tangent could not be factored."""
-    contacts_added: torch.Tensor
-    """(c,) bool, True if points must be added before the next step."""
-
-    @classmethod
-    def begin(
-        cls, velocities: torch.Tensor, forces: torch.Tensor, free: torch.Tensor, progress: torch.Tensor
-    ) -> _NewtonState:
-        """Create the state at the start of a round, with all worlds active."""
-        flags = torch.zeros((3, len(progress)), dtype=torch.bool, device=progress.device)
-        flags[0] = True
-        return cls(velocities, forces, free, progress, *flags)
-
-    def had(self, bits: int) -> torch.Tensor:
-        """Return (c,) bool, True for worlds whose last trial had any of ``bits`` as its outcome."""
-        return has_outcome(self.progress, bits)
