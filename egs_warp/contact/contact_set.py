@@ -134,6 +134,11 @@ class ContactSet(BatchedRecord):
         pairs = (self.nodes, wp.vec4i), (self.weights, Vec4), (self.axes, Mat33)
         return [as_warp(counts, wp.int32), *(self._array(*pair) for pair in pairs)]
 
+    @cached_property
+    def addresses(self) -> list[int]:
+        """Number of contacts of one world, and the host addresses of their nodes, weights and axes."""
+        return [self.count, *(array.ptr or 0 for array in self.arrays[1:])]
+
     def _array(self, values: Any, kind: Any) -> wp.array:
         """Return a Warp array (B, ...) of elements of type ``kind``, which shares the memory of contiguous values."""
         return as_warp(contiguous(values if self.counts is not None else values.reshape((1, *values.shape))), kind)

@@ -14,7 +14,6 @@ import warp as wp
 
 from egs_warp.fem.batched import contiguous, empty_like, launch_on, nonzero
 from egs_warp.kernels.contact import coulomb as kernels
-from egs_warp.kernels.contact.coulomb_equations import Contacts
 from egs_warp.launching import thread_local_cache
 from egs_warp.precision import Vec4, real
 
@@ -229,18 +228,6 @@ def enqueue_forces(
         outputs=[(residual, real)],
         block_dim=lanes,
     )
-
-
-def pack_contacts(delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float) -> Any:
-    """Return the kernels' ``Contacts``, which share the memory of these arrays (shapes as in ``coulomb_forces``)."""
-    contacts = Contacts()
-    contacts.count, contacts.friction = len(shift), friction
-    contacts.delassus, contacts.free_velocity, contacts.normal_bias = (
-        _shared(delassus),
-        _shared(free_velocity),
-        _shared(shift),
-    )
-    return contacts
 
 
 def _shared(values: np.ndarray) -> wp.array:

@@ -140,7 +140,7 @@ class NewtonWorkspace:
     def linearize(self, problem: StepProblem, contacts: ContactSet) -> None:
         """Linearise ``contacts`` with the current factors, asynchronously."""
         self.set_contacts(contacts)
-        self._run(self.enqueue_linearization, problem.dt, 1.0 + problem.dt * problem.drag)
+        self._run(self.enqueue_linearization, problem.dt, problem.inertia_ratio)
 
     def download_delassus(self) -> np.ndarray:
         """Return the (3K, 3K) m/(N s) Delassus operator that ``linearize`` has downloaded. The caller synchronises
@@ -182,7 +182,7 @@ class NewtonWorkspace:
             self.set_contacts(contacts)
             self.upload_start(tension, velocities, forces)
         self._upload_trial(0.0, False, forces, FROM_START)
-        readback = self._run_and_download(self._enqueue_predict, problem.dt, 1.0 + problem.dt * problem.drag)
+        readback = self._run_and_download(self._enqueue_predict, problem.dt, problem.inertia_ratio)
         return float(readback.residual_norm[0]), readback.velocities
 
     def _run(self, work: Callable[..., None], *args: Any) -> None:
@@ -221,7 +221,7 @@ class NewtonWorkspace:
         with self.owner.stream:
             self.upload_start(tension, velocities, forces)
             self._upload_trial(0.0, False, forces, FROM_START)
-            self._run(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
+            self._run(self._enqueue_trial, problem.dt, problem.inertia_ratio)
             self._trial_upload.start_copy()
 
     def upload_start(self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray) -> None:
@@ -237,7 +237,7 @@ class NewtonWorkspace:
         3) from the slot ``base``, and block until it is evaluated.
         """
         self._upload_trial(length, True, target_forces, base)
-        return self._run_and_download(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
+        return self._run_and_download(self._enqueue_trial, problem.dt, problem.inertia_ratio)
 
     def start_newton(
         self,
@@ -261,7 +261,7 @@ class NewtonWorkspace:
             base: slot to start from, ``FROM_BASE`` or ``FROM_TRIAL``.
             enabled: (1,) int32 on the device; 0 skips the loop. None always runs it.
         """
-        dt, ratio = problem.dt, 1.0 + problem.dt * problem.drag
+        dt, ratio = problem.dt, problem.inertia_ratio
         self.started, self.owner.last_solve = progress.row.copy(), None
         row = progress.row.copy()
         row[convergence_kernels.UNIT] = problem.residual_scale
@@ -375,7 +375,7 @@ class NewtonWorkspace:
             velocities: (N, 3) m/s, at the slot.
             base: slot at which the tangent is computed.
         """
-        owner, ratio = self.owner, 1.0 + problem.dt * problem.drag
+        owner, ratio = self.owner, problem.inertia_ratio
         with owner.stream:
             self._set_base(base)
             owner.factors.upload_diagonal(ratio * np.repeat(owner.body.node_mass, 3))

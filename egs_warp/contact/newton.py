@@ -83,12 +83,17 @@ class ContactLinearization:
         return NativeNewtonIterate.at(self, tension, velocities, forces)
 
 
-class ContactLinearizer(Protocol):
-    """Protocol of the objects that build the contact linearisations of one body."""
+class ContactLinearizer:
+    """Builder of the contact linearisations of one body, with NumPy arrays on the host. ``DeviceContactLinearizer`` is
+    the one on a GPU.
+    """
+
+    is_on_host = True
+    """False if matrices and gaps are on a GPU."""
 
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> ContactLinearization:
         """Linearise ``contacts`` with ``tangent``."""
-        ...
+        return ContactLinearization.of(tangent, contacts)
 
     def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
         """Select the contacts of a step where the gaps are on a GPU.
@@ -101,50 +106,13 @@ class ContactLinearizer(Protocol):
         Returns:
             The contacts; None if the gaps are on the host.
         """
-        ...
-
-    def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray, loaded: np.ndarray) -> None:
-        """Start ``select_contacts`` for the probable next step, of ``dt`` seconds from ``state``; ``before`` (m,) are
-        the contact points of the step that ends there, and ``loaded`` (m,) is True for those that carry load.
-        """
-        ...
-
-    def predict_velocities(
-        self,
-        tangent: Tangent,
-        contacts: ContactSet,
-        tension: MuscleEnergy | None,
-        velocities: np.ndarray,
-        forces: np.ndarray,
-    ) -> np.ndarray | None:
-        """Take one Newton step with fixed contact forces.
-
-        Args:
-            tangent: factored tangent.
-            contacts: n contacts.
-            tension: muscle energy of the step, or None.
-            velocities: (N, 3) m/s, initial velocities.
-            forces: (n, 3) newtons.
-
-        Returns:
-            (N, 3) m/s; None if the step inverts an element.
-        """
-        ...
-
-
-class HostContactLinearizer:
-    """``ContactLinearizer`` with NumPy arrays."""
-
-    def __call__(self, tangent: Tangent, contacts: ContactSet) -> ContactLinearization:
-        """Linearise ``contacts`` with ``tangent``."""
-        return ContactLinearization.of(tangent, contacts)
-
-    def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
-        """Return None; the caller selects contacts on the host."""
         return None
 
     def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray, loaded: np.ndarray) -> None:
-        """Do nothing; there is no device to work in parallel."""
+        """Start ``select_contacts`` for the probable next step, of ``dt`` seconds from ``state``, if the gaps are on a
+        GPU; ``before`` (m,) are the contact points of the step that ends there, and ``loaded`` (m,) is True for those
+        that carry load.
+        """
 
     def predict_velocities(
         self,
@@ -156,6 +124,16 @@ class HostContactLinearizer:
     ) -> np.ndarray | None:
         """Take one Newton step with fixed contact forces. This needs one right-hand side; a linearisation needs three
         for each contact.
+
+        Args:
+            tangent: factored tangent.
+            contacts: n contacts.
+            tension: muscle energy of the step, or None.
+            velocities: (N, 3) m/s, initial velocities.
+            forces: (n, 3) newtons.
+
+        Returns:
+            (N, 3) m/s; None if the step inverts an element.
         """
         problem, workspace = tangent.problem, host_newton_workspace(contacts.node_count)
         state = IterateBuffer.of(contacts, velocities, forces)

@@ -19,7 +19,7 @@ from egs_warp.fem.panel_cholesky import CHUNK_BYTES, PANEL, PanelCholesky
 from egs_warp.fem.warp_elasticity import MuscleSegmentMaps, WarpElasticity
 from egs_warp.kernels.fem import step_start as kernels
 from egs_warp.muscles.muscle_set import MuscleSet
-from egs_warp.muscles.tension import force_length_factor
+from egs_warp.muscles.tension import segment_stiffnesses
 from egs_warp.precision import Mat33, Vec3, real
 
 _MIN_LENGTH = 1e-300
@@ -83,8 +83,7 @@ class BatchBody:
         vectors = rows @ positions
         lengths = vectors.norm(dim=2).clamp(min=_MIN_LENGTH)
         directions = vectors / lengths[:, :, None]
-        share, _, slope = force_length_factor(lengths / rest_lengths)
-        across, stretch = tensions * share / lengths, tensions * slope / rest_lengths
+        across, stretch = segment_stiffnesses(tensions, lengths, rest_lengths)
         largest = torch.maximum(across.abs(), stretch.abs()).amax(dim=1, keepdim=True).clamp(min=_MIN_LENGTH)
         across, stretch = (
             torch.where(rate.abs() > MIN_RELATIVE_STIFFNESS * largest, rate, 0.0) for rate in (across, stretch)

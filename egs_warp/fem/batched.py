@@ -41,6 +41,15 @@ class BatchedRecord:
             elif rows is not value:  # Records of all worlds may share a tensor, see ``subset``.
                 value[worlds] = rows
 
+    def download(self) -> list[Self]:
+        """Return the record of each world on the host, with NumPy arrays and Python's numbers."""
+        columns = {
+            name: value.download() if isinstance(value, BatchedRecord) else _rows_on_host(value)
+            for name, value in self.batched_fields()
+        }
+        rows = zip(*columns.values(), strict=True)
+        return [replace(self, **dict(zip(columns, row, strict=True))) for row in rows]
+
     def batched_fields(self) -> list[tuple[str, Any]]:
         """Return names and values of the fields that are arrays or records of arrays."""
         values = [(field.name, getattr(self, field.name)) for field in fields(self)]
@@ -49,6 +58,10 @@ class BatchedRecord:
 
 def _rows(value: Any, worlds: torch.Tensor) -> Any:
     return value.gather(worlds) if isinstance(value, BatchedRecord) else value[worlds]
+
+
+def _rows_on_host(value: torch.Tensor) -> list[Any]:
+    return value.tolist() if value.ndim == 1 else list(value.cpu().numpy())
 
 
 def _count(value: Any) -> int:

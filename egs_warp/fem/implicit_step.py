@@ -9,7 +9,7 @@ the step of one world in NumPy arrays (N, 3), ``batch_problem.BatchProblem`` tho
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from egs_warp.fem.batched import BatchedRecord, array_module
 from egs_warp.fem.body import BodyState, SoftBody
@@ -24,7 +24,7 @@ class UnsolvableStepError(ArithmeticError):
     """The equations of a step cannot be solved."""
 
 
-class StepValues:
+class StepValues(Protocol):
     """Values that ``ImplicitStep`` takes from its subclasses."""
 
     node_mass: Any
@@ -38,7 +38,7 @@ class StepValues:
 
     def internal_gradient(self, velocities: Any, tension: Any) -> Any:
         """Return minus the forces of elasticity, damping and muscles at the end of the step: (..., N, 3) N."""
-        raise NotImplementedError
+        ...
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -51,24 +52,9 @@ class BatchState(BatchedRecord):
 class BatchStep(BatchedRecord):
     """Result of one step of c worlds, on the device."""
 
-    dt: float
-    """s."""
     after: BatchState
-    contacts: ContactSet
-    forces: torch.Tensor
-    """(c, K, 3) N."""
-    end_gaps: torch.Tensor
-    """(c, K) m."""
-    min_gap: torch.Tensor
-    """(c,) m."""
-    activations: torch.Tensor
-    """(c, M) m."""
-    iterations: torch.Tensor
-    """(c,) int64, Newton iterations."""
-    converged: torch.Tensor
-    """(c,) bool."""
-    added_spin: torch.Tensor
-    """(c,) rad/s, see ``StepReport``."""
+    report: StepReport
+    """Report of all worlds in tensors with a leading world axis, without timings."""
 
     @property
     def worlds(self) -> torch.Tensor:
@@ -76,30 +62,12 @@ class BatchStep(BatchedRecord):
         return self.after.worlds
 
     def reports(self) -> list[StepReport]:
-        """Download the step; return one report for each of ``worlds``, like that of a single stepper but without
-        timings."""
-        values = self.after.positions, self.after.velocities, self.after.time, self.forces, self.end_gaps
-        positions, velocities, times, forces, end_gaps = (each.cpu().numpy() for each in values)
-        values = self.min_gap, self.activations, self.iterations, self.converged, self.added_spin
-        min_gap, activations, iterations, converged, spins = (each.cpu().numpy() for each in values)
-        reports = []
-        for world, contacts in enumerate(self.contacts.download()):
-            report = StepReport(
-                state=BodyState(positions[world], velocities[world], float(times[world])),
-                dt=self.dt,
-                contacts=contacts,
-                forces=forces[world, : contacts.count],
-                end_gaps=end_gaps[world, : contacts.count],
-                min_gap=float(min_gap[world]),
-                activations=activations[world],
-                qp_count=0,
-                qp_infeasible=0,
-                newton_iterations=int(iterations[world]),
-                converged=bool(converged[world]),
-                added_spin=float(spins[world]),
-            )
-            reports.append(report)
-        return reports
+        """Download the step; return one report for each of ``worlds``, like that of a single stepper."""
+        reports, counts = self.report.download(), self.after.counts.tolist()
+        return [
+            replace(report, forces=report.forces[:count], end_gaps=report.end_gaps[:count])
+            for report, count in zip(reports, counts, strict=True)
+        ]
 
 
 class BatchStepper:
@@ -238,7 +206,7 @@ class BatchStepper:
             after, done, failed = self._parts(state, on_device, dt, MAX_HALVINGS)
             solved = torch.zeros(len(self._frictions), dtype=torch.bool, device=self.device)
             for step in done:
-                solved[step.worlds] |= step.converged
+                solved[step.worlds] |= step.report.converged
             failed |= ~solved[state.worlds]
             solved[state.worlds[failed]] = False
             solved_steps = [step.subset(nonzero(solved[step.worlds])) for step in done]
@@ -258,11 +226,12 @@ class BatchStepper:
             State of the solved worlds, their steps, and (c,) bool, True for failed worlds.
         """
         step, failed = self._step(state, activations, dt)
-        repeated = nonzero(~step.converged & ~failed)
+        converged = step.report.converged
+        repeated = nonzero(~converged & ~failed)
         if max_halvings == 0 or len(repeated) == 0:
             solved = nonzero(~failed)
             return step.after.subset(solved), [step.subset(solved)], failed
-        solved = nonzero(step.converged & ~failed)
+        solved = nonzero(converged & ~failed)
         done, after = [step.subset(solved)], step.after.subset(solved)
         half, rows, half_activations = state.gather(repeated), repeated, activations[repeated]
         for _ in range(2):
@@ -279,9 +248,9 @@ class BatchStepper:
             inputs, previous_forces = self._start(state, self._stiffness * activations, dt, self.settings.drag)
         response, velocities, forces, failed = self._predict(inputs, previous_forces)
         contacts, result = self.solver.solve(inputs, response, velocities=velocities, forces=forces)
-        step = self._finish(inputs, contacts, result, state, activations)
         failed |= result.is_singular
-        return replace(step, converged=step.converged & ~failed), failed
+        result = replace(result, converged=result.converged & ~failed)
+        return self._finish(inputs, contacts, result, state, activations), failed
 
     def _start(
         self, state: BatchState, tensions: torch.Tensor, dt: float, drag: float
@@ -356,18 +325,22 @@ class BatchStepper:
             *(state.worlds, end, result.velocities, state.time + problem.dt),
             *(contacts.points, contacts.counts, result.forces),
         )
-        return BatchStep(
-            dt=problem.dt,
-            after=after,
-            contacts=contacts,
-            forces=result.forces,
-            end_gaps=contacts.end_gaps(problem.dt, result.velocities),
-            min_gap=gaps.amin(dim=1),
-            activations=activations,
-            iterations=result.iterations,
-            converged=result.converged,
-            added_spin=problem.momentum_correction(internal).norm(dim=1),
-        )
+        values: Any = after.positions, after.velocities, after.time
+        report: Any = {
+            "state": BodyState(*values),
+            "dt": problem.dt,
+            "contacts": contacts,
+            "forces": result.forces,
+            "end_gaps": contacts.end_gaps(problem.dt, result.velocities),
+            "min_gap": gaps.amin(dim=1),
+            "activations": activations,
+            "qp_count": 0,
+            "qp_infeasible": 0,
+            "newton_iterations": result.iterations,
+            "converged": result.converged,
+            "added_spin": problem.momentum_correction(internal).norm(dim=1),
+        }
+        return BatchStep(after, StepReport(**report))
 
 
 def _merged(one: BatchState, other: BatchState) -> BatchState:

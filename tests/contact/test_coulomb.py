@@ -12,11 +12,12 @@ import torch
 import warp as wp
 
 from egs_warp.contact import coulomb, newton
-from egs_warp.contact.coulomb import coulomb_forces, coulomb_forces_of_worlds, pack_contacts
-from egs_warp.kernels.contact.coulomb import sweeps_kernel
+from egs_warp.contact.coulomb import coulomb_forces, coulomb_forces_of_worlds
+from egs_warp.kernels.contact.coulomb_equations import Contacts
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn, sagging
+from tests.support.kernels import sweeps_kernel
 
 COUNT = 5
 
@@ -56,7 +57,10 @@ def test_sweeps_equal_their_twin(friction: float, sweeps: int) -> None:
     for seed in range(60):
         delassus, free, shift, start = problem(seed)
         forces = wp.array(start.ravel(), dtype=wp.float64, device="cpu")
-        given = pack_contacts(delassus, free, shift, friction)
+        given = Contacts()
+        given.count, given.friction = len(shift), friction
+        arrays = (wp.array(each, dtype=wp.float64, device="cpu") for each in (delassus, free, shift))
+        given.delassus, given.free_velocity, given.normal_bias = arrays
         wp.launch(sweeps_kernel, dim=1, inputs=[given, sweeps, forces], device="cpu")
         got = forces.numpy().reshape(-1, 3)
         expected = swept_twin(delassus, free, shift, friction, start, sweeps)
