@@ -17,11 +17,12 @@ from egs_warp.contact.coulomb import DELASSUS_REGULARIZATION, coulomb_forces_of_
 from egs_warp.contact.coupled_step import MAX_ACTIVATION_ROUNDS, NewtonOptions
 from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS
 from egs_warp.contact.newton_round import run_round
+from egs_warp.contact.trial import NewtonDirection, Trial, TrialStep, enqueue_trial
 from egs_warp.fem.batch_problem import BatchProblem, apply_inverse
 from egs_warp.fem.batched import BatchedRecord, launch_on, nonzero, padded
 from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.kernels.contact import newton_convergence as rule
-from egs_warp.precision import real
+from egs_warp.precision import Vec3, real
 
 
 class StageTimer(Protocol):
@@ -65,26 +66,29 @@ class BatchInputs(BatchedRecord):
     start_faces: torch.Tensor
     """(c, P) int32, their faces."""
 
-    def residuals(self, velocities: torch.Tensor, forces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (c, N, 3) N s, the residuals at ``velocities`` (c, N, 3) without and with ``forces`` (c, K, 3)."""
-        free = self.problem.residual(velocities, self.tensions)
-        return free, free - self.problem.dt * self.contacts.nodal_forces(forces)
+    def trial(self, lengths: torch.Tensor, direction: NewtonDirection) -> Trial:
+        """Evaluate the trial at the fractions ``lengths`` (c,) of Newton steps."""
+        problem, trial = self.problem, Trial.empty(direction.velocities, direction.forces)
+        step = TrialStep(
+            *(problem.dt, problem.inertia_ratio, Vec3(*(float(each) for each in problem.body.gravity))),
+            *(problem.node_mass, problem.state.positions, problem.state.velocities, problem.lever_arms),
+            *(problem.inverse_inertia, self._enqueue_internal),
+        )
+        enqueue_trial(step, self.contacts, lengths, direction, trial)
+        return trial
 
-    def residual_norms(self, rest: torch.Tensor) -> torch.Tensor:
-        """Return (c,), the norms of the residuals ``rest`` (c, N, 3), divided by dt x weight."""
-        return rest.flatten(1).norm(dim=1) / self.problem.residual_scale
+    def trial_at(self, velocities: torch.Tensor, forces: torch.Tensor) -> Trial:
+        """Evaluate the trial at ``velocities`` (c, N, 3) m/s and contact ``forces`` (c, K, 3) newtons."""
+        start = NewtonDirection(velocities, velocities, velocities, forces, forces)
+        return self.trial(velocities.new_zeros(len(velocities)), start)
 
+    def _enqueue_internal(self, ends: torch.Tensor, gradient: torch.Tensor, torque: torch.Tensor) -> None:
+        self.problem.enqueue_gradient(ends, self.tensions, gradient)
+        torch.bmm(self.problem.rotation_modes.mT, gradient.flatten(1)[:, :, None], out=torque[:, :, None])
 
-@dataclass(frozen=True)
-class NewtonStepEnd(BatchedRecord):
-    """End of a full Newton step of c worlds."""
-
-    velocities: torch.Tensor
-    """(c, N, 3) m/s."""
-    forces: torch.Tensor
-    """(c, K, 3) newtons, those that satisfy Coulomb's law at the contact-free velocities."""
-    coulomb_violation: torch.Tensor
-    """(c,) m/s, their violation of the law."""
+    def residual_norms(self, trial: Trial) -> torch.Tensor:
+        """Return (c,), the norms of the residuals of a ``trial``, divided by dt x weight."""
+        return trial.residual.flatten(1).norm(dim=1) / self.problem.residual_scale
 
 
 @dataclass(frozen=True)
@@ -130,9 +134,9 @@ class BatchSolver(NewtonOptions):
         velocities: torch.Tensor,
         residual: torch.Tensor,
         forces: torch.Tensor,
-    ) -> NewtonStepEnd:
-        """Take a full Newton step in c worlds, with the contact forces that satisfy Coulomb's law at the velocities
-        that it would reach without them.
+    ) -> tuple[NewtonDirection, torch.Tensor]:
+        """Compute the full Newton step of c worlds, with the contact forces that satisfy Coulomb's law at the
+        velocities without them.
 
         Args:
             inputs: inputs of the worlds.
@@ -140,6 +144,9 @@ class BatchSolver(NewtonOptions):
             velocities: (c, N, 3) m/s, at the start.
             residual: (c, N, 3) N s, residual there without contact forces.
             forces: (c, K, 3) newtons, initial forces of the Coulomb solve.
+
+        Returns:
+            The step, and (c,) m/s, the violation of Coulomb's law by its forces.
         """
         contacts = inputs.contacts
         with self.stages("substitute"):
@@ -150,7 +157,7 @@ class BatchSolver(NewtonOptions):
             operands = response.delassus, speeds, inputs.normal_bias, inputs.frictions, forces
             target_forces, violation = coulomb_forces_of_worlds(contacts.counts, *operands)
         force_velocities = (response.columns @ target_forces.flatten(1)[:, :, None]).view_as(free)
-        return NewtonStepEnd(free + force_velocities, target_forces, violation)
+        return NewtonDirection(velocities, free, force_velocities, forces, target_forces), violation
 
     def solve(
         self, inputs: BatchInputs, response: BatchLinearization, *, velocities: torch.Tensor, forces: torch.Tensor
@@ -231,13 +238,16 @@ class _BatchRound:
         self._solver, self._inputs, self.response = solver, inputs, response
         self._velocities, self._forces = velocities, forces
         with solver.stages("elasticity"):
-            self._free_residual, rest = inputs.residuals(velocities, forces)
+            start = inputs.trial_at(velocities, forces)
         row = solver.progress(inputs.problem, last=last).row
-        self._progress = torch.as_tensor(row, device=rest.device).repeat(len(rest), 1)
-        self._progress[:, rule.RESIDUAL] = inputs.residual_norms(rest)
-        flags = torch.zeros((3, len(rest)), dtype=torch.bool, device=rest.device)
+        self._progress = torch.as_tensor(row, device=forces.device).repeat(len(forces), 1)
+        self._progress[:, rule.RESIDUAL] = inputs.residual_norms(start)
+        self._free_residual = start.free_residual
+        flags = torch.zeros((3, len(forces)), dtype=torch.bool, device=forces.device)
         self._is_active, self._is_singular, self._contacts_added = ~flags[0], *flags[1:]
-        self._end = NewtonStepEnd(*map(torch.empty_like, (velocities, forces, self._progress[:, 0])))
+        likes = velocities, velocities, velocities, forces, forces
+        self._direction = NewtonDirection(*map(torch.empty_like, likes))
+        self._violation = torch.empty_like(self._progress[:, 0])
 
     def result(self) -> BatchResult:
         """Return the result of the round."""
@@ -256,7 +266,9 @@ class _BatchRound:
         """Judge the trials at the ends of full Newton steps."""
         part = self._inputs.subset(worlds)
         start = self._velocities[worlds], self._free_residual[worlds], self._forces[worlds]
-        self._end.scatter(worlds, self._solver.newton_step(part, self.response.subset(worlds), *start))
+        direction, violation = self._solver.newton_step(part, self.response.subset(worlds), *start)
+        self._direction.scatter(worlds, direction)
+        self._violation[worlds] = violation
         self._try(worlds, part)
 
     def halve_step(self, worlds: torch.Tensor) -> None:
@@ -264,19 +276,15 @@ class _BatchRound:
         self._try(worlds, self._inputs.subset(worlds))
 
     def _try(self, worlds: torch.Tensor, part: BatchInputs) -> None:
-        progress, end = self._progress[worlds], self._end.gather(worlds)
-        length = progress[:, rule.LENGTH, None, None]
-        velocities, forces = (
-            start[worlds] + length * (target - start[worlds])
-            for start, target in ((self._velocities, end.velocities), (self._forces, end.forces))
-        )
+        progress = self._progress[worlds]
         with self._solver.stages("elasticity"):
-            free, rest = part.residuals(velocities, forces)
-        _judge(progress, part.residual_norms(rest), end.coulomb_violation)
+            trial = part.trial(progress[:, rule.LENGTH].contiguous(), self._direction.gather(worlds))
+        _judge(progress, part.residual_norms(trial), self._violation[worlds])
         self._progress[worlds] = progress
         good = has_outcome(progress, rule.ACCEPTED)
         at = worlds[good]
-        self._velocities[at], self._forces[at], self._free_residual[at] = velocities[good], forces[good], free[good]
+        self._velocities[at], self._forces[at] = trial.velocities[good], trial.forces[good]
+        self._free_residual[at] = trial.free_residual[good]
 
     def stop(self, bits: int) -> None:
         """End the round of the worlds whose last trial had any of ``bits`` as its outcome."""

@@ -1,6 +1,6 @@
 """Buffers and CUDA graphs of a step with contact on a GPU, where a round of Newton steps is one loop on the device.
 
-The kernels are in ``kernels/contact/iterate.py`` and ``kernels/contact/newton_convergence.py``. One vector holds an
+Trials are those of ``trial``; the rule of the loop is ``kernels/contact/newton_convergence.py``. One vector holds an
 iterate (see ``NewtonWorkspace.parts``). There are two, base and trial, and a start buffer that the host fills.
 
 A Newton loop is three graphs. ``_enqueue_loop_start`` copies the row of ``NewtonProgress`` and sets the loop condition.
@@ -23,15 +23,16 @@ import warp as wp
 from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coulomb import FAILURE_TOLERANCE
 from egs_warp.contact.device_coulomb import CoulombWorkspace
-from egs_warp.contact.device_step import StepWorkspace, one_world, vectors
+from egs_warp.contact.device_step import StepWorkspace, vectors
 from egs_warp.contact.newton_convergence import NewtonProgress
+from egs_warp.contact.trial import NewtonDirection, Trial, TrialStep, enqueue_trial
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.kernels.contact import iterate as kernels
 from egs_warp.kernels.contact import newton_convergence as convergence_kernels
 from egs_warp.muscles.tension import MuscleEnergy
-from egs_warp.precision import Mat33, Vec3, real
+from egs_warp.precision import Vec3, real
 
 FROM_BASE, FROM_TRIAL, FROM_START = 0.0, 1.0, 2.0
 """Slot that a trial starts from: the base as it is, the last trial, or the start buffer."""
@@ -120,6 +121,16 @@ class NewtonWorkspace:
         self._base, self._trial = owner.zeros(3 * size + width), owner.zeros(3 * size + width)
         self.end_positions, self._gradient, self._residual, self._force_velocities = owner.zeros(4, size)
         self._torque = owner.zeros(3)
+        velocities, free_velocities, _, forces = self.parts(self._base)
+        self._direction = NewtonDirection(
+            *map(_one_world, (velocities, free_velocities, self._force_velocities, forces, self.target_forces))
+        )
+        velocities, _, free_residual, forces = self.parts(self._trial)
+        nodal = self.end_positions, self._gradient
+        self._trial_record = Trial(
+            *map(_one_world, (velocities, forces, *nodal)),
+            *(self._torque[None], _one_world(free_residual), _one_world(self._residual)),
+        )
         self._graphs = GraphCache(owner.stream)
         self.base_iterate: Any = None
         self.trial_iterate: Any = None
@@ -490,43 +501,25 @@ class NewtonWorkspace:
 
     def enqueue_residual(self, dt: float, ratio: float) -> None:
         """Compute the velocities, forces and residual of the trial in ``trial_input``."""
-        owner, nodes = self.owner, self._node_count
+        owner = self.owner
         self._enqueue_base()
-        velocities, _, free_residual, forces = self.parts(self._trial)
-        old, old_free_velocities, _, old_forces = self.parts(self._base)
-        lengths, target_forces = as_warp(self.trial_input[:1], real), self.target_forces
-        torch.mv(self.columns, target_forces, out=self._force_velocities)
+        torch.mv(self.columns, self.target_forces, out=self._force_velocities)
         self._force_velocities.mul_(self.trial_input[1])
-        self._launch(
-            kernels.trial_kernel,
-            nodes,
-            [
-                vectors(owner.positions),
-                dt,
-                lengths,
-                vectors(old),
-                vectors(old_free_velocities),
-                vectors(self._force_velocities),
-            ],
-            [vectors(velocities), vectors(self.end_positions)],
+        step = TrialStep(
+            *(dt, ratio, Vec3(*(float(each) for each in owner.body.gravity)), owner.masses),
+            *map(_one_world, (owner.positions, owner.velocities, owner.lever_arms)),
+            owner.inverse_inertia,
+            lambda *_: self._enqueue_internal(dt),
         )
-        self._launch(
-            kernels.trial_forces_kernel,
-            self.capacity,
-            [lengths, vectors(old_forces), vectors(target_forces)],
-            [vectors(forces)],
-        )
+        enqueue_trial(step, self._contacts, self.trial_input[:1], self._direction, self._trial_record)
+
+    def _enqueue_internal(self, dt: float) -> None:
+        """Compute the internal gradient and its torque at the end of the trial."""
+        owner = self.owner
         owner.enqueue_gradient(vectors(self.end_positions), dt, self._tensions, vectors(self._gradient))
         torch.mv(owner.rotation_modes.T, self._gradient, out=self._torque)
-        gravity = Vec3(*(float(each) for each in owner.body.gravity))
-        inertia = as_warp(owner.inverse_inertia.view(1, 3, 3), Mat33)
-        self._launch(
-            kernels.residual_kernel,
-            (1, nodes),
-            [
-                *(as_warp(owner.masses, real), gravity, ratio, dt, one_world(owner.lever_arms), inertia),
-                *(one_world(owner.velocities), *self._contacts.arrays, vectors(self._torque)),
-                *(one_world(each) for each in (self._gradient, velocities, forces)),
-            ],
-            [one_world(free_residual), one_world(self._residual)],
-        )
+
+
+def _one_world(flat: torch.Tensor) -> torch.Tensor:
+    """View a ``flat`` tensor (3n,) as vectors of one world (1, n, 3)."""
+    return flat.view(1, -1, 3)

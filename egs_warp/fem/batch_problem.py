@@ -108,6 +108,8 @@ class BatchProblem(ImplicitStep):
     """(c,) slot of each world's factors, ascending."""
     start_gradients: torch.Tensor
     """(c, T, 3, 3) deformation gradients at the start of the step."""
+    lever_arms: torch.Tensor
+    """(c, N, 3) m, positions relative to the centre of mass."""
     rotation_modes: torch.Tensor
     """(c, 3N, 3) m, nodal velocities e_k x r of unit rotations about the centre of mass."""
     inverse_inertia: torch.Tensor
@@ -139,15 +141,7 @@ class BatchProblem(ImplicitStep):
         modes = positions.new_empty(len(positions), 3 * len(common.mass), 3)
         inverse_inertia = positions.new_empty(len(positions), 3, 3)
         arms, guess = torch.empty_like(positions), torch.empty_like(positions)
-        lanes = 1 if common.elements.device.is_cpu else kernels.BLOCK
-        launch_on(
-            common.device,
-            kernels.step_start_kernel,
-            (len(positions), lanes),
-            inputs=[dt, (common.mass, real), (positions, Vec3), (velocities, Vec3)],
-            outputs=[(arms, Vec3), (modes, real), (inverse_inertia, Mat33), (guess, Vec3)],
-            block_dim=lanes,
-        )
+        enqueue_step_start(dt, common.mass, (positions, velocities), arms, modes, inverse_inertia, guess)
         gradients = positions.new_empty(len(positions), len(common.body.mesh.tets), 3, 3)
         common.elements.enqueue_start(as_warp(positions, Vec3), as_warp(gradients, Mat33))
         state: Any = positions, velocities
@@ -156,6 +150,7 @@ class BatchProblem(ImplicitStep):
             worlds=common,
             slots=slots,
             start_gradients=gradients,
+            lever_arms=arms,
             rotation_modes=modes,
             inverse_inertia=inverse_inertia,
             rigid_guess=guess,
@@ -180,12 +175,18 @@ class BatchProblem(ImplicitStep):
 
     def internal_gradient(self, velocities: torch.Tensor, tension: torch.Tensor | None) -> torch.Tensor:
         """Return minus the internal forces (c, N, 3) N at the end of the step, with muscle tensions (c, M) N."""
-        gradient, worlds = torch.empty_like(velocities), self.worlds
-        segments, loads = (None, None) if tension is None else (worlds.segments, as_warp(tension, real))
-        end = as_warp(self.end_positions(velocities), Vec3)
-        start = as_warp(self.start_gradients, Mat33)
-        worlds.elements.enqueue_gradient(end, start, self.dt, segments, as_warp(gradient, Vec3), loads)
+        gradient = torch.empty_like(velocities)
+        self.enqueue_gradient(self.end_positions(velocities), tension, gradient)
         return gradient
+
+    def enqueue_gradient(self, ends: torch.Tensor, tension: torch.Tensor | None, gradient: torch.Tensor) -> None:
+        """Write minus the internal forces at the end positions ``ends`` (c, N, 3) to ``gradient``, as
+        ``internal_gradient``.
+        """
+        worlds = self.worlds
+        segments, loads = (None, None) if tension is None else (worlds.segments, as_warp(tension, real))
+        arrays = as_warp(ends, Vec3), as_warp(self.start_gradients, Mat33), as_warp(gradient, Vec3)
+        worlds.elements.enqueue_gradient(*arrays[:2], self.dt, segments, arrays[2], loads)
 
     def factor(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
         """Factor the derivative of the residual, or a positive definite approximation of it, into the worlds' slots.
@@ -237,6 +238,30 @@ class BatchProblem(ImplicitStep):
             factored[remaining] = factors.status[slots[remaining]] == FactorStatus.DEFINITE
             remaining = nonzero(~factored)
         return factored
+
+
+def enqueue_step_start(
+    dt: float,
+    mass: torch.Tensor,
+    state: tuple[torch.Tensor, torch.Tensor],
+    arms: torch.Tensor,
+    modes: torch.Tensor,
+    inverse_inertia: torch.Tensor,
+    guess: torch.Tensor,
+) -> None:
+    """Write the values at the start of steps of ``dt`` seconds: lever arms (c, N, 3), rotation modes (c, 3N, 3),
+    inverse inertia (c, 3, 3) and rigid guess (c, N, 3), for the ``mass`` (N,) of the nodes and the ``state``, positions
+    and velocities (c, N, 3).
+    """
+    lanes = kernels.BLOCK if arms.is_cuda else 1
+    launch_on(
+        arms,
+        kernels.step_start_kernel,
+        (len(arms), lanes),
+        inputs=[dt, (mass, real), *((each, Vec3) for each in state)],
+        outputs=[(arms, Vec3), (modes, real), (inverse_inertia, Mat33), (guess, Vec3)],
+        block_dim=lanes,
+    )
 
 
 def apply_inverse(

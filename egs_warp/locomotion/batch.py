@@ -283,7 +283,7 @@ class BatchStepper:
         with stages("factor"):
             failed = ~problem.factor(velocities, None)
         with stages("elasticity"):
-            _, residual = inputs.residuals(velocities, previous_forces)
+            residual = inputs.trial_at(velocities, previous_forces).residual
         with stages("substitute"):
             newton_step, _ = apply_inverse(problem, residual.flatten(1)[:, :, None])
         trial = velocities - newton_step.view_as(velocities)
@@ -299,13 +299,14 @@ class BatchStepper:
                 break
             part = inputs.subset(active)
             with stages("elasticity"):
-                residual = part.problem.residual(velocities[active], part.tensions)
-            start = velocities[active], residual, previous_forces[active]
-            end = solver.newton_step(part, response.subset(active), *start)
-            forces[active] = end.forces
-            solved = part.problem.is_inversion_free(end.velocities)
+                start = part.trial_at(velocities[active], previous_forces[active])
+            operands = start.velocities, start.free_residual, start.forces
+            step, _ = solver.newton_step(part, response.subset(active), *operands)
+            forces[active] = step.target_forces
+            ends = step.free_velocities + step.force_velocities
+            solved = part.problem.is_inversion_free(ends)
             active = active[solved]
-            velocities[active], previous_forces[active] = end.velocities[solved], end.forces[solved]
+            velocities[active], previous_forces[active] = ends[solved], step.target_forces[solved]
         return response, velocities, forces, failed
 
     def _finish(

@@ -1,7 +1,8 @@
-"""Kernels that evaluate a trial of Newton's method on a step with contact on a GPU, one thread for each node or
-contact (Eq. 4, 8).
+"""Kernels that evaluate a trial of Newton's method on steps with contact, one thread for each node or contact of each
+world (Eq. 4, 8).
 
-The host code is ``egs_warp/contact/device_newton_workspace.py``; ``iterate_cpu`` is the version on a CPU.
+The host code is ``egs_warp/contact/trial.py``, and ``device_newton_workspace.py`` for the first and the last kernel;
+``iterate_cpu`` is the version on a CPU.
 """
 
 import warp as wp
@@ -32,47 +33,49 @@ def select_base_kernel(
 @wp.kernel
 def trial_kernel(
     # Model:
-    starts: wp.array[Vec3],
+    starts: wp.array2d[Vec3],
     dt: real,
     # In:
     lengths: wp.array[real],
-    velocities: wp.array[Vec3],
-    free_velocities: wp.array[Vec3],
-    force_velocities: wp.array[Vec3],
+    velocities: wp.array2d[Vec3],
+    free_velocities: wp.array2d[Vec3],
+    force_velocities: wp.array2d[Vec3],
     # Out:
-    velocities_out: wp.array[Vec3],
-    ends_out: wp.array[Vec3],
+    velocities_out: wp.array2d[Vec3],
+    ends_out: wp.array2d[Vec3],
 ):
-    """Move the velocities along a Newton step by the fraction ``lengths[0]``, and compute the end positions of the
-    nodes.
+    """Move the velocities of each world along a Newton step by the fraction in ``lengths``, and compute the end
+    positions of the nodes.
 
     The full step ends at ``free_velocities`` (without contact forces) plus ``force_velocities`` (their effect). At
     length 0 they need not be finite.
     """
-    node = wp.tid()
-    velocity = velocities[node]
-    if lengths[0] != real(0.0):
-        end = free_velocities[node] + force_velocities[node]
-        velocity = velocities[node] + lengths[0] * (end - velocities[node])
-    velocities_out[node] = velocity
-    ends_out[node] = starts[node] + dt * velocity
+    world, node = wp.tid()
+    length = lengths[world]
+    velocity = velocities[world, node]
+    if length != real(0.0):
+        end = free_velocities[world, node] + force_velocities[world, node]
+        velocity += length * (end - velocity)
+    velocities_out[world, node] = velocity
+    ends_out[world, node] = starts[world, node] + dt * velocity
 
 
 @wp.kernel
 def trial_forces_kernel(
     # In:
     lengths: wp.array[real],
-    forces: wp.array[Vec3],
-    target_forces: wp.array[Vec3],
+    forces: wp.array2d[Vec3],
+    target_forces: wp.array2d[Vec3],
     # Out:
-    forces_out: wp.array[Vec3],
+    forces_out: wp.array2d[Vec3],
 ):
-    """Move the contact ``forces`` towards ``target_forces`` by the fraction ``lengths[0]``."""
-    contact = wp.tid()
-    force = forces[contact]
-    if lengths[0] != real(0.0):
-        force = forces[contact] + lengths[0] * (target_forces[contact] - forces[contact])
-    forces_out[contact] = force
+    """Move the contact ``forces`` of each world towards ``target_forces`` by the fraction in ``lengths``."""
+    world, contact = wp.tid()
+    length = lengths[world]
+    force = forces[world, contact]
+    if length != real(0.0):
+        force += length * (target_forces[world, contact] - force)
+    forces_out[world, contact] = force
 
 
 @wp.kernel
