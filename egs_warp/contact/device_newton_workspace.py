@@ -126,9 +126,8 @@ class NewtonWorkspace:
             *map(_one_world, (velocities, free_velocities, self._force_velocities, forces, self.target_forces))
         )
         velocities, _, free_residual, forces = self.parts(self._trial)
-        nodal = self.end_positions, self._gradient
         self._trial_record = Trial(
-            *map(_one_world, (velocities, forces, *nodal)),
+            *(_one_world(velocities), _one_world(forces), _one_world(self.end_positions), _one_world(self._gradient)),
             *(self._torque[None], _one_world(free_residual), _one_world(self._residual)),
         )
         self._graphs = GraphCache(owner.stream)
@@ -507,7 +506,7 @@ class NewtonWorkspace:
         self._force_velocities.mul_(self.trial_input[1])
         step = TrialStep(
             *(dt, ratio, Vec3(*(float(each) for each in owner.body.gravity)), owner.masses),
-            *map(_one_world, (owner.positions, owner.velocities, owner.lever_arms)),
+            *(_one_world(owner.positions), _one_world(owner.velocities), _one_world(owner.lever_arms)),
             owner.inverse_inertia,
             lambda *_: self._enqueue_internal(dt),
         )

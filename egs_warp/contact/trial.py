@@ -80,7 +80,7 @@ class Trial(BatchedRecord):
         """Allocate a trial for velocities and forces of these shapes."""
         nodal = [torch.empty_like(velocities) for _ in range(5)]
         torque = velocities.new_empty((len(velocities), 3))
-        return cls(nodal[0], torch.empty_like(forces), *nodal[1:3], torque, *nodal[3:])
+        return cls(nodal[0], torch.empty_like(forces), nodal[1], nodal[2], torque, nodal[3], nodal[4])
 
 
 def enqueue_trial(

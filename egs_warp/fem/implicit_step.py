@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from egs_warp.fem.batched import BatchedRecord, array_module
-from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.body import SoftBody
 from egs_warp.fem.momentum_projection import MomentumProjection
 
 UNSOLVABLE = "the tangent is singular or not finite"
@@ -54,8 +54,8 @@ class ImplicitStep(StepValues, BatchedRecord):
 
     body: SoftBody
     """The body."""
-    state: BodyState
-    """State at the start of the step, (..., N, 3)."""
+    state: Any
+    """``BodyState`` at the start of the step, (..., N, 3)."""
     dt: float
     """Step size, s."""
     drag: float = 0.0
