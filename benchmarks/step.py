@@ -81,7 +81,7 @@ def contact_errors(creature: Creature, before: StepReport, step: StepReport) -> 
             contacts.contact_velocities(free), shift, creature.geometry.friction, step.forces
         )
         expected = free + response.columns @ forces.ravel()
-        errors[place] = (contacts.dense_jacobian @ (expected - step.state.velocities.ravel()))[loaded]
+        errors[place] = (contacts.jacobian @ (expected - step.state.velocities.ravel()))[loaded]
     return errors
 
 

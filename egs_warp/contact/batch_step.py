@@ -12,22 +12,17 @@ from typing import Protocol
 import torch
 import warp as wp
 
-from egs_warp.contact.batch_contacts import BatchContacts, append_points, padded, penetrating_points, point_gaps
-from egs_warp.contact.coupled_step import (
-    ACTIVATION_RESIDUAL,
-    COULOMB_TOLERANCE,
-    MAX_ACTIVATION_ROUNDS,
-    PUSH_OUT_FRACTION,
-)
-from egs_warp.contact.detection import ContactDetector
-from egs_warp.contact.device_coulomb import coulomb_forces_batch
-from egs_warp.contact.newton import DELASSUS_REGULARIZATION
-from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
-from egs_warp.contact.selection import ContactSelector
-from egs_warp.fem.batch_problem import BatchMomentumProjection, BatchProblem, apply_inverse
-from egs_warp.fem.batched import BatchedRecord, launch_on, nonzero
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.coulomb import DELASSUS_REGULARIZATION, coulomb_forces_of_worlds, regularized
+from egs_warp.contact.coupled_step import MAX_ACTIVATION_ROUNDS, NewtonOptions
+from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS
+from egs_warp.contact.newton_round import run_round
+from egs_warp.contact.trial import NewtonDirection, Trial, TrialStep, enqueue_trial
+from egs_warp.fem.batch_problem import BatchProblem, apply_inverse
+from egs_warp.fem.batched import BatchedRecord, launch_on, nonzero, padded
+from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.kernels.contact import newton_convergence as rule
-from egs_warp.precision import real
+from egs_warp.precision import Vec3, real
 
 
 class StageTimer(Protocol):
@@ -47,11 +42,53 @@ def no_timer(name: str) -> AbstractContextManager[object]:
 class BatchLinearization(BatchedRecord):
     """``ContactLinearization`` of c worlds, with the tangents in their slots."""
 
-    momentum_projection: BatchMomentumProjection
+    momentum_projection: MomentumProjection
     columns: torch.Tensor
     """(c, 3N, 3K) m/s per newton, dt J^-1 W^T."""
     delassus: torch.Tensor
     """(c, 3K, 3K) m/(N s), the regularised Delassus operator."""
+
+
+@dataclass(frozen=True)
+class BatchInputs(BatchedRecord):
+    """Inputs of Newton's method in c worlds."""
+
+    problem: BatchProblem
+    contacts: ContactSet
+    normal_bias: torch.Tensor
+    """(c, K) m/s, bias of the normal velocities."""
+    tensions: torch.Tensor
+    """(c, M) newtons, muscle tensions."""
+    frictions: torch.Tensor
+    """(c,) Coulomb coefficients."""
+    start_gaps: torch.Tensor
+    """(c, P) m, gaps of all points at the start of the step."""
+    start_faces: torch.Tensor
+    """(c, P) int32, their faces."""
+
+    def trial(self, lengths: torch.Tensor, direction: NewtonDirection) -> Trial:
+        """Evaluate the trial at the fractions ``lengths`` (c,) of Newton steps."""
+        problem, trial = self.problem, Trial.empty(direction.velocities, direction.forces)
+        step = TrialStep(
+            *(problem.dt, problem.inertia_ratio, Vec3(*(float(each) for each in problem.body.gravity))),
+            *(problem.node_mass, problem.state.positions, problem.state.velocities, problem.lever_arms),
+            *(problem.inverse_inertia, self._enqueue_internal),
+        )
+        enqueue_trial(step, self.contacts, lengths, direction, trial)
+        return trial
+
+    def trial_at(self, velocities: torch.Tensor, forces: torch.Tensor) -> Trial:
+        """Evaluate the trial at ``velocities`` (c, N, 3) m/s and contact ``forces`` (c, K, 3) newtons."""
+        start = NewtonDirection(velocities, velocities, velocities, forces, forces)
+        return self.trial(velocities.new_zeros(len(velocities)), start)
+
+    def _enqueue_internal(self, ends: torch.Tensor, gradient: torch.Tensor, torque: torch.Tensor) -> None:
+        self.problem.enqueue_gradient(ends, self.tensions, gradient)
+        torch.bmm(self.problem.rotation_modes.mT, gradient.flatten(1)[:, :, None], out=torque[:, :, None])
+
+    def residual_norms(self, trial: Trial) -> torch.Tensor:
+        """Return (c,), the norms of the residuals of a ``trial``, divided by dt x weight."""
+        return trial.residual.flatten(1).norm(dim=1) / self.problem.residual_scale
 
 
 @dataclass(frozen=True)
@@ -73,233 +110,201 @@ class BatchResult(BatchedRecord):
 
 
 @dataclass(frozen=True)
-class BatchSolver:
+class BatchSolver(NewtonOptions):
     """``CoupledSolver`` for many worlds."""
 
-    detector: ContactDetector
-    points: ContactSelector
-    push_out_cap: float
-    """Maximum push-out speed, m/s."""
-    penetration_tolerance: float
-    """Depth up to which a point is not pushed out, m."""
-    tolerance: float
-    """Residual divided by dt x weight at which a world has converged."""
     stages: StageTimer = no_timer
 
-    def normal_bias(self, contacts: BatchContacts, dt: float) -> torch.Tensor:
-        """Return (c, K) m/s, the velocity bias of ``push_out_speeds``."""
-        gaps = contacts.gaps
-        deep = ((gaps + self.penetration_tolerance).clamp(max=0.0) * PUSH_OUT_FRACTION / dt).clamp(
-            min=-self.push_out_cap
-        )
-        return (gaps.clamp(min=0.0) / dt + deep) * contacts.valid
-
     def linearize(
-        self, problem: BatchProblem, contacts: BatchContacts, momentum_projection: BatchMomentumProjection | None = None
+        self, problem: BatchProblem, contacts: ContactSet, momentum_projection: MomentumProjection | None = None
     ) -> BatchLinearization:
         """Linearise ``contacts`` with the tangents in the worlds' slots; the momentum projection is computed unless it
         is passed.
         """
         with self.stages("substitute"):
-            columns, momentum_projection = apply_inverse(
-                problem, problem.dt * contacts.jacobian_transposed(problem.positions.shape[1]), momentum_projection
-            )
-        delassus = contacts.contact_velocities(columns)
-        diagonal = delassus.diagonal(dim1=1, dim2=2)
-        mean = diagonal.sum(dim=1, keepdim=True) / (3 * contacts.counts[:, None]).clamp(min=1)
-        diagonal += DELASSUS_REGULARIZATION * mean
+            impulses = problem.dt * contacts.jacobian_transposed()
+            columns, momentum_projection = apply_inverse(problem, impulses, momentum_projection)
+        delassus = regularized(contacts.contact_velocities(columns), DELASSUS_REGULARIZATION, contacts.counts)
         return BatchLinearization(momentum_projection, columns, delassus)
 
-    def solve_coulomb(
+    def newton_step(
         self,
-        contacts: BatchContacts,
+        inputs: BatchInputs,
         response: BatchLinearization,
-        free: torch.Tensor,
-        shift: torch.Tensor,
-        frictions: torch.Tensor,
-        start: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Solve Coulomb's law and complementarity for the contact forces.
+        velocities: torch.Tensor,
+        residual: torch.Tensor,
+        forces: torch.Tensor,
+    ) -> tuple[NewtonDirection, torch.Tensor]:
+        """Compute the full Newton step of c worlds, with the contact forces that satisfy Coulomb's law at the
+        velocities without them.
 
         Args:
-            contacts: contacts of c worlds.
-            response: their linearisation.
-            free: (c, N, 3) m/s, nodal velocities without contact forces.
-            shift: (c, K) m/s, bias of the normal velocities.
-            frictions: (c,) Coulomb coefficients.
-            start: (c, K, 3) newtons, initial forces.
+            inputs: inputs of the worlds.
+            response: linearisation of their contacts.
+            velocities: (c, N, 3) m/s, at the start.
+            residual: (c, N, 3) N s, residual there without contact forces.
+            forces: (c, K, 3) newtons, initial forces of the Coulomb solve.
 
         Returns:
-            (c, K, 3) newtons, and their violation of the law (c,) in m/s.
+            The step, and (c,) m/s, the violation of Coulomb's law by its forces.
         """
+        contacts = inputs.contacts
+        with self.stages("substitute"):
+            solved, _ = apply_inverse(inputs.problem, residual.flatten(1)[:, :, None], response.momentum_projection)
+        free = velocities - solved.view_as(velocities)
         with self.stages("coulomb"):
-            speeds = contacts.contact_velocities(free.flatten(1)[:, :, None])[:, :, 0]
-            return coulomb_forces_batch(contacts.counts, response.delassus, speeds, shift, frictions, start)
+            speeds = contacts.contact_velocities(free.flatten(1))
+            operands = response.delassus, speeds, inputs.normal_bias, inputs.frictions, forces
+            target_forces, violation = coulomb_forces_of_worlds(contacts.counts, *operands)
+        force_velocities = (response.columns @ target_forces.flatten(1)[:, :, None]).view_as(free)
+        return NewtonDirection(velocities, free, force_velocities, forces, target_forces), violation
 
     def solve(
-        self,
-        problem: BatchProblem,
-        contacts: BatchContacts,
-        response: BatchLinearization,
-        tensions: torch.Tensor,
-        frictions: torch.Tensor,
-        *,
-        velocities: torch.Tensor,
-        forces: torch.Tensor,
-        start_gaps: tuple[torch.Tensor, torch.Tensor],
-    ) -> tuple[BatchContacts, BatchResult]:
+        self, inputs: BatchInputs, response: BatchLinearization, *, velocities: torch.Tensor, forces: torch.Tensor
+    ) -> tuple[ContactSet, BatchResult]:
         """Solve the steps with Newton's method.
 
         Args:
-            problem: the steps of c worlds.
-            contacts: initial contacts.
-            response: their linearisation.
-            tensions: (c, M) newtons, muscle tensions.
-            frictions: (c,) Coulomb coefficients.
+            inputs: the steps of c worlds, with their initial contacts.
+            response: linearisation of these contacts.
             velocities: (c, N, 3) m/s, initial velocities.
             forces: (c, K, 3) newtons, initial forces.
-            start_gaps: (c, P) m, gaps at the start of the step, and (c, P), their faces.
 
         Returns:
             The contacts at the end, and the result.
         """
-        count = len(velocities)
-        result = BatchResult(
-            velocities.clone(),
-            forces.clone(),
-            torch.zeros(count, dtype=torch.bool, device=velocities.device),
-            torch.zeros(count, dtype=torch.int64, device=velocities.device),
-            *torch.zeros((2, count), dtype=torch.bool, device=velocities.device),
-        )
+        problem, contacts, count = inputs.problem, inputs.contacts, len(velocities)
+        flags = torch.zeros((3, count), dtype=torch.bool, device=velocities.device)
+        iterations = torch.zeros(count, dtype=torch.int64, device=velocities.device)
+        result = BatchResult(velocities.clone(), forces.clone(), flags[0], iterations, *flags[1:])
         todo = all_worlds = torch.arange(count, device=velocities.device)
         for number in range(MAX_ACTIVATION_ROUNDS):
-            part, active_contacts = problem.subset(todo), contacts.subset(todo)
-            shift, gaps = self.normal_bias(active_contacts, problem.dt), start_gaps[0][todo]
-            task = _RoundInputs(part, active_contacts, shift, tensions[todo], frictions[todo], gaps)
+            active = contacts.subset(todo)
+            bias = self.normal_bias(active, problem.dt)
+            part = replace(inputs.subset(todo), contacts=active, normal_bias=bias)
             last = number == MAX_ACTIVATION_ROUNDS - 1
-            done, left = self._round(task, response, result.velocities[todo], result.forces[todo], last=last)
+            newton = _BatchRound(self, part, response, result.velocities[todo], result.forces[todo], last=last)
+            run_round(newton)
+            done = newton.result()
             done = replace(done, iterations=done.iterations + result.iterations[todo])
             result.scatter(todo, done)
             if last:
                 break
             with self.stages("detect"):
-                added, ends = self._points_to_add(task, done.velocities)
+                added, ends = self.points_to_add(part, done.velocities)
             more = nonzero((added >= 0).any(dim=1) & (done.converged | done.contacts_added))
             if len(more) == 0:
                 break
-            positions, *gaps_there = (each[todo[more]] for each in (problem.positions, *start_gaps))
-            points, counts = append_points(self.points, active_contacts.gather(more), added[more], ends[more])
-            grown = BatchContacts.at(self.detector, points, counts, positions, gaps_there)
+            points, counts = self.points.append_in_worlds(active.gather(more), added[more], ends[more])
+            grown = part.gather(more)
+            start = grown.start_gaps, grown.start_faces
+            grown = self.detector.contact_sets(points, counts, grown.problem.state.positions, start)
             grown = grown.with_capacity(max(grown.capacity, contacts.capacity))
             extra = grown.capacity - contacts.capacity
-            forces = padded(done.forces[more], extra)
             # Copy, since the caller's contacts must not change.
             contacts = contacts.with_capacity(grown.capacity).gather(all_worlds)
             result = replace(result, forces=padded(result.forces, extra))
             todo = todo[more]
             contacts.scatter(todo, grown)
-            result.forces[todo] = forces
-            response = self.linearize(problem.subset(todo), grown, left.momentum_projection.gather(more))
+            result.forces[todo] = padded(done.forces[more], extra)
+            response = self.linearize(problem.subset(todo), grown, newton.response.momentum_projection.gather(more))
         return contacts, result
 
-    def _points_to_add(self, task: _RoundInputs, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def points_to_add(self, inputs: BatchInputs, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (c, C), the points of each cell that would be too deep at the end of the step with ``velocities`` (c,
         N, 3), or -1, and (c, P) m, all gaps at the end.
         """
-        gaps, _ = point_gaps(self.detector, task.problem.end_positions(velocities))
+        gaps, _ = self.detector.gaps_of_worlds(inputs.problem.end_positions(velocities))
         tolerance = self.penetration_tolerance
-        return penetrating_points(self.points, task.contacts, (gaps, task.start_gaps), tolerance), gaps
+        return self.points.find_penetrating_in_worlds(inputs.contacts, (gaps, inputs.start_gaps), tolerance), gaps
 
-    def _round(
+
+class _BatchRound:
+    """``NewtonWorlds`` of c worlds; a set of worlds is a tensor of ascending indices."""
+
+    def __init__(
         self,
-        task: _RoundInputs,
+        solver: BatchSolver,
+        inputs: BatchInputs,
         response: BatchLinearization,
         velocities: torch.Tensor,
         forces: torch.Tensor,
         *,
         last: bool,
-    ) -> tuple[BatchResult, BatchLinearization]:
-        """Run Newton's method with the contacts of ``task`` until points must be added, which never happens in the
-        ``last`` round. Return the result and the last linearisations.
+    ) -> None:
+        """Start a round, in which no points are added if it is the ``last``. ``velocities`` (c, N, 3) m/s and
+        ``forces`` (c, K, 3) newtons are updated in place, and so is ``response``, the linearisation.
         """
-        with self.stages("elasticity"):
-            free, size = task.contact_free_residual(velocities, forces)
-        state = _NewtonState.begin(velocities, forces, free, self._progress(task.problem, size, last=last))
-        for _ in range(MAX_NEWTON_STEPS):
-            active = nonzero(state.active)
-            if len(active) == 0:
-                break
-            part, search = task.subset(active), state.subset(active)
-            self._newton_step(part, search, response.subset(active))
-            search.active.copy_(~search.had(rule.ENDED | rule.FAILED))
-            to_check = nonzero(search.had(rule.NEAR_END) & ~search.had(rule.ENDED))
-            if len(to_check) > 0:
-                self._check_penetration(part.subset(to_check), search, to_check)
-            fresh = nonzero(search.had(rule.NEEDS_TANGENT) & search.active)
-            if len(fresh) > 0:
-                again = part.subset(fresh)
-                with self.stages("factor"):
-                    factored = again.problem.factor(search.velocities[fresh], again.tensions)
-                response.scatter(active[fresh], self.linearize(again.problem, again.contacts))
-                search.progress[fresh, rule.TANGENT_IS_CURRENT] = 1.0
-                search.is_singular[fresh] = ~factored
-                search.active[fresh] = factored
-            if search is not state:
-                state.scatter(active, search)
-        ends = (
-            state.velocities,
-            state.forces,
-            state.had(rule.ENDED),
-            state.progress[:, rule.STEPS].long(),
-            state.is_singular,
-            state.contacts_added,
-        )
-        return BatchResult(*ends), response
+        self._solver, self._inputs, self.response = solver, inputs, response
+        self._velocities, self._forces = velocities, forces
+        with solver.stages("elasticity"):
+            start = inputs.trial_at(velocities, forces)
+        row = solver.progress(inputs.problem, last=last).row
+        self._progress = torch.as_tensor(row, device=forces.device).repeat(len(forces), 1)
+        self._progress[:, rule.RESIDUAL] = inputs.residual_norms(start)
+        self._free_residual = start.free_residual
+        flags = torch.zeros((3, len(forces)), dtype=torch.bool, device=forces.device)
+        self._is_active, self._is_singular, self._contacts_added = ~flags[0], *flags[1:]
+        likes = velocities, velocities, velocities, forces, forces
+        self._direction = NewtonDirection(*map(torch.empty_like, likes))
+        self._violation = torch.empty_like(self._progress[:, 0])
 
-    def _progress(self, problem: BatchProblem, size: torch.Tensor, *, last: bool) -> torch.Tensor:
-        """Return (c, ROW_SIZE), the progress at the start of a round with residuals ``size`` (c,)."""
-        coulomb_tolerance = COULOMB_TOLERANCE * problem.residual_scale / problem.body.body.mass
-        first = NewtonProgress(self.tolerance, -1.0 if last else ACTIVATION_RESIDUAL, coulomb_tolerance)
-        progress = torch.as_tensor(first.row, device=size.device).repeat(len(size), 1)
-        progress[:, rule.RESIDUAL] = size
-        return progress
+    def result(self) -> BatchResult:
+        """Return the result of the round."""
+        ended, steps = has_outcome(self._progress, rule.ENDED), self._progress[:, rule.STEPS].long()
+        return BatchResult(self._velocities, self._forces, ended, steps, self._is_singular, self._contacts_added)
 
-    def _check_penetration(self, task: _RoundInputs, search: _NewtonState, rows: torch.Tensor) -> None:
-        """Find points to add in the worlds of ``task``, which are the rows ``rows`` of ``search``, and end the round of
-        worlds in which there are some.
-        """
-        with self.stages("detect"):
-            added, _ = self._points_to_add(task, search.velocities[rows])
-        joined = (added >= 0).any(dim=1)
-        search.contacts_added[rows], search.active[rows] = joined, ~joined
+    def running(self) -> torch.Tensor:
+        """Return the active worlds that have steps left."""
+        return nonzero(self._is_active & (self._progress[:, rule.STEPS] < MAX_NEWTON_STEPS))
 
-    def _newton_step(self, task: _RoundInputs, search: _NewtonState, response: BatchLinearization) -> None:
-        """Take one Newton step in each world of ``search``, in place."""
-        problem = task.problem
-        with self.stages("substitute"):
-            solved, _ = apply_inverse(
-                problem, search.contact_free_residual.flatten(1)[:, :, None], response.momentum_projection
-            )
-        free_velocities = search.velocities - solved.view_as(search.velocities)
-        target_forces, violation = self.solve_coulomb(
-            task.contacts, response, free_velocities, task.normal_bias, task.frictions, search.forces
-        )
-        force_velocities = (response.columns @ target_forces.flatten(1)[:, :, None]).view_as(free_velocities)
-        change, force_change = free_velocities + force_velocities - search.velocities, target_forces - search.forces
-        waiting, length = torch.arange(len(violation), device=violation.device), 1.0
-        while len(waiting) > 0:
-            trial = search.velocities[waiting] + length * change[waiting]
-            trial_forces = search.forces[waiting] + length * force_change[waiting]
-            with self.stages("elasticity"):
-                free, size = task.subset(waiting).contact_free_residual(trial, trial_forces)
-            progress = search.progress[waiting]
-            _judge(progress, size, violation[waiting])
-            search.progress[waiting] = progress
-            good = has_outcome(progress, rule.ACCEPTED)
-            at = waiting[good]
-            search.velocities[at], search.forces[at] = trial[good], trial_forces[good]
-            search.contact_free_residual[at] = free[good]
-            waiting, length = waiting[has_outcome(progress, rule.SHORTEN)], 0.5 * length
+    def active(self, bits: int) -> torch.Tensor:
+        """Return the active worlds whose last trial had any of ``bits`` as its outcome."""
+        return nonzero(self._is_active & has_outcome(self._progress, bits))
+
+    def take_step(self, worlds: torch.Tensor) -> None:
+        """Judge the trials at the ends of full Newton steps."""
+        part = self._inputs.subset(worlds)
+        start = self._velocities[worlds], self._free_residual[worlds], self._forces[worlds]
+        direction, violation = self._solver.newton_step(part, self.response.subset(worlds), *start)
+        self._direction.scatter(worlds, direction)
+        self._violation[worlds] = violation
+        self._try(worlds, part)
+
+    def halve_step(self, worlds: torch.Tensor) -> None:
+        """Judge the trials at the reduced lengths."""
+        self._try(worlds, self._inputs.subset(worlds))
+
+    def _try(self, worlds: torch.Tensor, part: BatchInputs) -> None:
+        progress = self._progress[worlds]
+        with self._solver.stages("elasticity"):
+            trial = part.trial(progress[:, rule.LENGTH].contiguous(), self._direction.gather(worlds))
+        _judge(progress, part.residual_norms(trial), self._violation[worlds])
+        self._progress[worlds] = progress
+        good = has_outcome(progress, rule.ACCEPTED)
+        at = worlds[good]
+        self._velocities[at], self._forces[at] = trial.velocities[good], trial.forces[good]
+        self._free_residual[at] = trial.free_residual[good]
+
+    def stop(self, bits: int) -> None:
+        """End the round of the worlds whose last trial had any of ``bits`` as its outcome."""
+        self._is_active &= ~has_outcome(self._progress, bits)
+
+    def check_penetration(self, worlds: torch.Tensor) -> None:
+        """End the round of those of the ``worlds`` in which points must be added to the contacts."""
+        with self._solver.stages("detect"):
+            added, _ = self._solver.points_to_add(self._inputs.subset(worlds), self._velocities[worlds])
+        self._contacts_added[worlds] = (added >= 0).any(dim=1)
+        self._is_active &= ~self._contacts_added
+
+    def renew_tangent(self, worlds: torch.Tensor) -> None:
+        """Factor and linearise the ``worlds`` at their velocities, and end the round of those without factors."""
+        part = self._inputs.subset(worlds)
+        with self._solver.stages("factor"):
+            factored = part.problem.factor(self._velocities[worlds], part.tensions)
+        self.response.scatter(worlds, self._solver.linearize(part.problem, part.contacts))
+        self._progress[worlds, rule.TANGENT_IS_CURRENT] = 1.0
+        self._is_singular[worlds], self._is_active[worlds] = ~factored, factored
 
 
 def _judge(progress: torch.Tensor, sizes: torch.Tensor, violations: torch.Tensor) -> None:
@@ -317,63 +322,3 @@ def _judge(progress: torch.Tensor, sizes: torch.Tensor, violations: torch.Tensor
 def has_outcome(progress: torch.Tensor, bits: int) -> torch.Tensor:
     """Return (c,) bool, True for worlds whose last trial had any of ``bits``; ``progress`` is (c, ROW_SIZE)."""
     return (progress[:, rule.OUTCOME].long() & bits) > 0
-
-
-@dataclass(frozen=True)
-class _RoundInputs(BatchedRecord):
-    """Inputs of a round of c worlds."""
-
-    problem: BatchProblem
-    contacts: BatchContacts
-    normal_bias: torch.Tensor
-    """(c, K) m/s."""
-    tensions: torch.Tensor
-    """(c, M) newtons."""
-    frictions: torch.Tensor
-    """(c,) Coulomb coefficients."""
-    start_gaps: torch.Tensor
-    """(c, P) m, gaps at the start of the step."""
-
-    def contact_free_residual(
-        self, velocities: torch.Tensor, forces: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (c, N, 3) N s, the residual without contact forces at ``velocities`` (c, N, 3), and (c,) the norm of
-        the residual with ``forces`` (c, K, 3), divided by dt x weight.
-        """
-        problem = self.problem
-        free = problem.residual(velocities, self.tensions)
-        rest = free - problem.dt * self.contacts.nodal_forces(forces, velocities.shape[1])
-        return free, rest.flatten(1).norm(dim=1) / problem.residual_scale
-
-
-@dataclass(frozen=True)
-class _NewtonState(BatchedRecord):
-    """State of Newton's method in c worlds, written in place."""
-
-    velocities: torch.Tensor
-    """(c, N, 3) m/s."""
-    forces: torch.Tensor
-    """(c, K, 3) newtons."""
-    contact_free_residual: torch.Tensor
-    """(c, N, 3) N s, residual without contact forces."""
-    progress: torch.Tensor
-    """(c, ROW_SIZE) progress of the round (``NewtonProgress``)."""
-    active: torch.Tensor
-    """(c,) bool, True while the world is being solved."""
-    is_singular: torch.Tensor
-    """(c,) bool, True if a tangent could not be factored."""
-    contacts_added: torch.Tensor
-    """(c,) bool, True if points must be added before the next step."""
-
-    @classmethod
-    def begin(
-        cls, velocities: torch.Tensor, forces: torch.Tensor, free: torch.Tensor, progress: torch.Tensor
-    ) -> _NewtonState:
-        """Create the state at the start of a round, with all worlds active."""
-        flags = torch.zeros((3, len(progress)), dtype=torch.bool, device=progress.device)
-        flags[0] = True
-        return cls(velocities, forces, free, progress, *flags)
-
-    def had(self, bits: int) -> torch.Tensor:
-        """Return (c,) bool, True for worlds whose last trial had any of ``bits`` as its outcome."""
-        return has_outcome(self.progress, bits)

@@ -1,14 +1,19 @@
-"""Contact forces with exact Coulomb friction for a given Delassus operator (Eq. 8, 9)."""
+"""Contact forces with exact Coulomb friction for a given Delassus operator, in one world or in many (Eq. 8, 9).
+
+``coulomb_forces`` solves for one world on the host, ``coulomb_forces_of_worlds`` for many in tensors; where the kernel
+fails, both continue from compliant contacts. ``device_coulomb`` queues the kernel alone on a GPU.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from egs_warp.fem.batched import contiguous, empty_like, launch_on, nonzero
 from egs_warp.kernels.contact import coulomb as kernels
-from egs_warp.kernels.contact.coulomb_equations import Contacts
 from egs_warp.launching import thread_local_cache
 from egs_warp.precision import Vec4, real
 
@@ -21,6 +26,41 @@ REGULARIZATION_STEPS = (1e-4, 1e-5, 1e-6, 1e-7)
 diagonal, each solve starting from the forces of the one before. With many points on few nodes the operator is nearly
 singular, and most starts do not converge; with compliant contacts they do.
 """
+
+DELASSUS_REGULARIZATION = 1e-7
+"""Diagonal shift of the Delassus operator, as a fraction of the mean of its diagonal. The operator is singular if there
+are more points than the cage can resolve.
+"""
+
+
+def regularized(delassus: Any, fraction: float, counts: Any = None, out: Any = None) -> Any:
+    """Add ``fraction`` of the mean of the diagonal to the diagonal.
+
+    Args:
+        delassus: (3n, 3n) of one world, or (B, 3K, 3K), m/(N s).
+        fraction: compliance of the contacts.
+        counts: (B,) number of contacts of each world, which are the terms of its mean; None if all are.
+        out: contiguous memory of the result, or None.
+    """
+    size, out = delassus.shape[-1], empty_like(delassus, delassus.shape) if out is None else out
+    out[:] = delassus
+    total = delassus.diagonal(0, -2, -1).sum(-1)
+    mean = total / (max(size, 1) if counts is None else (3 * counts).clip(1, None))
+    diagonal = out.reshape((*delassus.shape[:-2], -1))[..., :: size + 1]
+    diagonal += (fraction * mean)[..., None]
+    return out
+
+
+def _continue_from_compliance(
+    solve: Callable[[Any, Any], tuple[Any, Any]], delassus: Any, forces: Any, counts: Any = None
+) -> tuple[Any, Any]:
+    """Solve with less and less compliant contacts, starting from ``forces``; ``solve`` maps an operator and initial
+    forces to forces and their residual. Return those of the operator itself.
+    """
+    residual = None
+    for softness in (*REGULARIZATION_STEPS, 0.0):
+        forces, residual = solve(regularized(delassus, softness, counts), forces)
+    return forces, residual
 
 
 def coulomb_forces(
@@ -58,11 +98,9 @@ def coulomb_forces(
     result, residual = workspace.solve(delassus, free_velocity, shift, friction, start)
     if residual <= FAILURE_TOLERANCE:
         return result, residual
-    forces, new_residual = start, residual
-    for softness in (*REGULARIZATION_STEPS, 0.0):
-        soft = delassus.copy()
-        soft[np.diag_indices_from(soft)] += softness * delassus.diagonal().mean()
-        forces, new_residual = workspace.solve(soft, free_velocity, shift, friction, forces)
+    forces, new_residual = _continue_from_compliance(
+        lambda soft, initial: workspace.solve(soft, free_velocity, shift, friction, initial), delassus, start
+    )
     return (forces, new_residual) if new_residual < residual else (result, residual)
 
 
@@ -101,16 +139,95 @@ class _CoulombWorkspace:
 _workspace = thread_local_cache(32)(_CoulombWorkspace)
 
 
-def pack_contacts(delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float) -> Any:
-    """Return the kernels' ``Contacts``, which share the memory of these arrays (shapes as in ``coulomb_forces``)."""
-    contacts = Contacts()
-    contacts.count, contacts.friction = len(shift), friction
-    contacts.delassus, contacts.free_velocity, contacts.normal_bias = (
-        _shared(delassus),
-        _shared(free_velocity),
-        _shared(shift),
+def coulomb_forces_of_worlds(
+    counts: Any,
+    delassus: Any,
+    free_velocity: Any,
+    shift: Any,
+    frictions: Any,
+    start: Any,
+) -> tuple[Any, Any]:
+    """Compute Coulomb forces of c worlds in tensors, as ``coulomb_forces`` does in one.
+
+    Args:
+        counts: (c,) int32, number of contacts of each world.
+        delassus: (c, 3K, 3K) m/(N s).
+        free_velocity: (c, 3K) m/s without contact forces.
+        shift: (c, K) m/s, bias of the normal velocities.
+        frictions: (c,).
+        start: (c, K, 3) newtons, initial forces.
+
+    Returns:
+        (c, K, 3) newtons and the residuals (c,) in m/s.
+    """
+    worlds, capacity, _ = start.shape
+    if worlds == 0 or capacity == 0:
+        return start.clone(), start.new_zeros(worlds)
+    result, residual = _solve_worlds(counts, delassus, free_velocity, shift, frictions, start)
+    failed = nonzero(residual > FAILURE_TOLERANCE)
+    if len(failed) == 0:
+        return result, residual
+    counts, operators, free, shift, frictions, forces = (
+        each[failed].contiguous() for each in (counts, delassus, free_velocity, shift, frictions, start)
     )
-    return contacts
+    forces, new_residual = _continue_from_compliance(
+        lambda soft, initial: _solve_worlds(counts, soft, free, shift, frictions, initial), operators, forces, counts
+    )
+    better = new_residual < residual[failed]
+    result[failed[better]], residual[failed[better]] = forces[better], new_residual[better]
+    return result, residual
+
+
+def _solve_worlds(
+    counts: Any,
+    delassus: Any,
+    free_velocity: Any,
+    shift: Any,
+    frictions: Any,
+    start: Any,
+) -> tuple[Any, Any]:
+    """Compute the forces with the kernel alone, without continuation."""
+    worlds, capacity, _ = start.shape
+    forces, residual, size = start.clone(), start.new_zeros(worlds), 3 * capacity
+    vectors = start.new_empty((worlds, 5, size))
+    indices = counts.new_empty((worlds, 2, size))
+    matrices = start.new_empty((worlds, size, (size + 4) // 4, 4))
+    values = tuple(contiguous(each) for each in (delassus, free_velocity, shift, frictions))
+    enqueue_forces(counts, values, forces.view(worlds, size), (vectors, indices, matrices), residual)
+    return forces, residual
+
+
+def enqueue_forces(
+    counts: Any,
+    values: tuple[Any, ...],
+    forces: Any,
+    scratch: tuple[Any, Any, Any],
+    residual: Any,
+) -> None:
+    """Queue the kernel for c worlds with contiguous arrays.
+
+    Args:
+        counts: (c,) int32, number of contacts of each world.
+        values: operators (c, 3K, 3K) m/(N s), contact velocities without contact forces (c, 3K) m/s, biases (c, K) m/s
+            and Coulomb coefficients (c,).
+        forces: (c, 3K) newtons, initial forces; overwritten with the solution.
+        scratch: (c, 5, 3K), (c, 2, 3K) int32 and (c, 3K, ceil((3K + 1) / 4), 4).
+        residual: (c,) m/s, overwritten with the residual of Coulomb's law.
+    """
+    vectors, indices, matrices = scratch
+    lanes = kernels.BLOCK if forces.is_cuda else 1
+    launch_on(
+        forces.device,
+        kernels.coulomb_kernel,
+        (len(forces), lanes),
+        inputs=[
+            (counts, wp.int32),
+            *((each, real) for each in values),
+            *(TOLERANCE, MAX_ITERATIONS, (forces, real), (vectors, real), (indices, wp.int32), (matrices, Vec4)),
+        ],
+        outputs=[(residual, real)],
+        block_dim=lanes,
+    )
 
 
 def _shared(values: np.ndarray) -> wp.array:

@@ -1,23 +1,24 @@
 """Newton's method on the velocities and contact forces of one step, until both equations hold (Eq. 4, 8, 9).
 
-A step is solved in rounds with a fixed contact set (``CoupledSolver._round``). A Newton step solves Coulomb's law for
-the contact forces, moves velocities and forces to the solution, and shortens the step while the residual is too large.
-Points that would end too deep are added to the set, and the next round begins. The iterates come from ``newton`` (host)
-or ``device_newton`` (GPU).
+A step is solved in rounds with a fixed contact set (``newton_round``). Points that would end a round too deep are added
+to the set, and the next round begins. The iterates come from ``newton`` (host) or ``device_newton`` (GPU).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from egs_warp.contact.detection import ContactDetector, ContactSet, push_out_speeds
-from egs_warp.contact.newton import ContactLinearization, NewtonIterate, PenetrationCheck
+from egs_warp.contact.contact_set import ContactSet, push_out_speeds
+from egs_warp.contact.detection import ContactDetector
+from egs_warp.contact.newton import ContactLinearization, NewtonIterate, NewtonStepResult, PenetrationCheck
 from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
+from egs_warp.contact.newton_round import run_round
 from egs_warp.contact.selection import ACTIVATION_DEPTH, ContactSelector
-from egs_warp.fem.step_problem import StepProblem
-from egs_warp.kernels.contact.newton_convergence import ACCEPTED, ENDED, FAILED, NEAR_END, NEEDS_TANGENT, SHORTEN
+from egs_warp.fem.implicit_step import ImplicitStep
+from egs_warp.kernels.contact.newton_convergence import ACCEPTED, ENDED
 from egs_warp.muscles.tension import MuscleEnergy
 
 MAX_ACTIVATION_ROUNDS = 6
@@ -54,8 +55,10 @@ class CoupledResult:
 
 
 @dataclass(frozen=True)
-class CoupledSolver:
-    """Newton's method on velocities and contact forces together."""
+class NewtonOptions:
+    """Tolerances of Newton's method on velocities and contact forces, in one world or in many, and the objects that
+    detect and select contacts.
+    """
 
     detector: ContactDetector
     points: ContactSelector
@@ -66,25 +69,32 @@ class CoupledSolver:
     tolerance: float = 1e-8
     """Residual divided by dt x weight at which the solve ends."""
 
-    def normal_bias(self, contacts: ContactSet, dt: float) -> np.ndarray:
+    def normal_bias(self, contacts: ContactSet, dt: float) -> Any:
         """Return the velocity bias added to each contact's normal velocity.
 
         It forbids further penetration during the step and pushes contacts that are deeper than
         ``penetration_tolerance`` out at a limited speed.
 
         Args:
-            contacts: n active contacts.
+            contacts: active contacts.
             dt: step size, s.
 
         Returns:
-            (n,) m/s.
+            (n,) m/s, or (B, K) with zeros as padding.
         """
-        return push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT_FRACTION, self.penetration_tolerance)
+        tolerance = self.penetration_tolerance
+        speeds = push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT_FRACTION, tolerance)
+        return speeds if contacts.counts is None else speeds * contacts.valid
 
-    def progress(self, problem: StepProblem, *, last: bool = False) -> NewtonProgress:
+    def progress(self, problem: ImplicitStep, *, last: bool = False) -> NewtonProgress:
         """Return the progress at the start of a round. In the ``last`` round no points are added."""
         coulomb_tolerance = COULOMB_TOLERANCE * problem.residual_scale / problem.body.mass
         return NewtonProgress(self.tolerance, -1.0 if last else ACTIVATION_RESIDUAL, coulomb_tolerance)
+
+
+@dataclass(frozen=True)
+class CoupledSolver(NewtonOptions):
+    """Newton's method on velocities and contact forces of one world."""
 
     def solve(
         self,
@@ -104,20 +114,27 @@ class CoupledSolver:
         """
         iterations = tangents = 0
         for number in range(MAX_ACTIVATION_ROUNDS):
-            result, wider = self._round(response, tension, velocities, forces, last=number == MAX_ACTIVATION_ROUNDS - 1)
-            response = result.linearization
-            iterations, tangents = iterations + result.iterations, tangents + result.factorization_count
-            velocities, forces = result.velocities, result.forces
-            if wider is None:
+            last = number == MAX_ACTIVATION_ROUNDS - 1
+            newton = _OneRound(self, response.iterate_at(tension, velocities, forces), last=last)
+            run_round(newton)
+            iterate, contacts = newton.iterate, newton.added_contacts
+            response = iterate.linearization
+            iterations, tangents = iterations + newton.progress.steps, tangents + newton.factorization_count
+            velocities, forces = iterate.velocities, iterate.forces
+            if newton.converged and not last:
+                contacts = self.with_penetrating_points(iterate)
+            if contacts is None:
                 break
-            forces = np.vstack([forces, np.zeros((wider.count - len(forces), 3))])
-            response = response.with_added_contacts(wider)
-        return replace(result, iterations=iterations, factorization_count=tangents)
+            forces = np.vstack([forces, np.zeros((contacts.count - len(forces), 3))])
+            response = response.with_added_contacts(contacts)
+        return CoupledResult(
+            *(iterate.velocities, iterate.linearization.contacts, iterate.forces, newton.converged),
+            *(iterate.residual_norm, iterations, tangents, iterate.linearization, iterate.penetration),
+        )
 
-    def _with_penetrating_points(
-        self, problem: StepProblem, contacts: ContactSet, end: NewtonIterate
-    ) -> ContactSet | None:
-        """Return ``contacts`` and the points that would be too deep at ``end``; None if there are none."""
+    def with_penetrating_points(self, end: NewtonIterate) -> ContactSet | None:
+        """Return the contacts of ``end`` and the points that would be too deep there; None if there are none."""
+        problem, contacts = end.linearization.tangent.problem, end.linearization.contacts
         check, start = end.penetration, problem.state.positions
         if check is not None and not check.is_penetrating:
             return None
@@ -132,48 +149,57 @@ class CoupledSolver:
             return None
         return contacts.concatenate(self.detector.contact_set(added, start))
 
-    def _round(
-        self,
-        response: ContactLinearization,
-        tension: MuscleEnergy | None,
-        velocities: np.ndarray,
-        forces: np.ndarray,
-        *,
-        last: bool,
-    ) -> tuple[CoupledResult, ContactSet | None]:
-        """Run Newton's method with the contacts of ``response``.
 
-        Returns:
-            The end of the round, and the extended contact set if penetrating points were found; None otherwise and in
-                the ``last`` round.
-        """
-        problem, contacts = response.tangent.problem, response.contacts
-        normal_bias = self.normal_bias(contacts, problem.dt)
-        friction, progress, tangents = self.detector.geometry.friction, self.progress(problem, last=last), 0
-        iterate = response.iterate_at(tension, velocities, forces)
-        while progress.steps < MAX_NEWTON_STEPS:
-            steps = iterate.newton_steps(normal_bias, friction, progress)
-            iterate, trial = steps.base, steps.trial
-            while progress.has(SHORTEN):
-                trial = iterate.line_search_point(steps.forces, progress.length)
-                progress.judge(trial.residual_norm, steps.coulomb_violation)
-            if progress.has(ACCEPTED):
-                iterate, ended = trial, progress.has(ENDED)
-                wider = self._with_penetrating_points(problem, contacts, trial) if progress.has(NEAR_END) else None
-                if ended or wider is not None:
-                    return _result(trial, ended, progress.steps, tangents), wider
-            if progress.has(FAILED):
-                break
-            if progress.has(NEEDS_TANGENT):
-                iterate = iterate.with_new_tangent()
-                tangents += 1
-                progress.renew_tangent()
-        return _result(iterate, False, progress.steps, tangents), None
+_WORLD = (0,)
+"""The set of the only world."""
 
 
-def _result(end: NewtonIterate, converged: bool, iterations: int, tangents: int) -> CoupledResult:
-    response = end.linearization
-    return CoupledResult(
-        *(end.velocities, response.contacts, end.forces, converged, end.residual_norm, iterations, tangents),
-        *(response, end.penetration),
-    )
+class _OneRound:
+    """``NewtonWorlds`` of one world; a set of worlds is ``_WORLD`` or empty."""
+
+    def __init__(self, solver: CoupledSolver, start: NewtonIterate, *, last: bool) -> None:
+        """Start a round at ``start``, in which no points are added if it is the ``last``."""
+        response, self._solver, self._is_active = start.linearization, solver, True
+        self.iterate, self._steps = start, NewtonStepResult(start, start.forces, 0.0, start)
+        self.factorization_count, self.converged = 0, False
+        self.added_contacts: ContactSet | None = None
+        self.progress = solver.progress(response.tangent.problem, last=last)
+        self._normal_bias = solver.normal_bias(response.contacts, response.tangent.problem.dt)
+
+    def running(self) -> tuple[int, ...]:
+        """Return the world if it is active and has steps left."""
+        return _WORLD if self._is_active and self.progress.steps < MAX_NEWTON_STEPS else ()
+
+    def active(self, bits: int) -> tuple[int, ...]:
+        """Return the world if it is active and its last trial had any of ``bits`` as its outcome."""
+        return _WORLD if self._is_active and self.progress.has(bits) else ()
+
+    def take_step(self, worlds: tuple[int, ...]) -> None:
+        """Judge the trial at the end of a full Newton step; a GPU makes accepted steps until one needs the host."""
+        friction = self._solver.detector.geometry.friction
+        self._steps = self.iterate.newton_steps(self._normal_bias, friction, self.progress)
+        self._accept(self._steps.trial)
+
+    def halve_step(self, worlds: tuple[int, ...]) -> None:
+        """Judge the trial at the reduced length."""
+        trial = self._steps.base.line_search_point(self._steps.forces, self.progress.length)
+        self.progress.judge(trial.residual_norm, self._steps.coulomb_violation)
+        self._accept(trial)
+
+    def _accept(self, trial: NewtonIterate) -> None:
+        self.iterate = trial if self.progress.has(ACCEPTED) else self._steps.base
+
+    def stop(self, bits: int) -> None:
+        """End the round if the last trial had any of ``bits`` as its outcome."""
+        self._is_active, self.converged = not self.progress.has(bits), self.progress.has(ENDED)
+
+    def check_penetration(self, worlds: tuple[int, ...]) -> None:
+        """End the round if points must be added to the contacts."""
+        self.added_contacts = self._solver.with_penetrating_points(self.iterate)
+        self._is_active = self.added_contacts is None
+
+    def renew_tangent(self, worlds: tuple[int, ...]) -> None:
+        """Factor and linearise at the velocities of the iterate."""
+        self.iterate = self.iterate.with_new_tangent()
+        self.factorization_count += 1
+        self.progress.renew_tangent()

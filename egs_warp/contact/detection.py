@@ -11,18 +11,18 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sparse
 import warp as wp
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.errors import ArgumentError
+from egs_warp.fem.batched import array_module, as_warp, contiguous
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
@@ -83,76 +83,6 @@ class ContactGeometry:
     def ground_heights(self, points: np.ndarray) -> np.ndarray:
         """Return the heights (...,) in metres of ``points`` (..., 3) above the ground."""
         return (self.field or self.planes[0]).heights(points)
-
-
-@dataclass(frozen=True)
-class ContactSet:
-    """The n active contact points of one step."""
-
-    points: np.ndarray
-    """(n,) indices into the geometry's points."""
-    nodes: np.ndarray
-    """(n, 4) int32, nodes of each point's tetrahedron."""
-    weights: np.ndarray
-    """(n, 4) float64, barycentric weights, sum 1."""
-    axes: np.ndarray
-    """(n, 3, 3), contact frames: the rows are the unit normal and two unit tangents."""
-    gaps: np.ndarray
-    """(n,) m, signed distance at the start of the step."""
-    faces: np.ndarray
-    """(n,) int32, index of the contact plane of each point; 0 is the ground, flat or not."""
-    node_count: int
-    """Number N of nodes."""
-
-    @property
-    def count(self) -> int:
-        """Number n of contacts."""
-        return len(self.points)
-
-    @cached_property
-    def jacobian(self) -> sparse.csr_matrix:
-        """Sparse (3n, 3N) contact Jacobian W. Rows 3i to 3i + 2 map nodal velocities to the normal and two
-        tangential velocities of contact i.
-        """
-        entries = self.weights[:, None, :, None] * self.axes[:, :, None]
-        columns = 3 * self.nodes[:, None, :, None] + np.arange(3, dtype=np.int32)
-        offsets = np.arange(0, entries.size + 1, 12, dtype=np.int32)
-        indices = np.broadcast_to(columns, entries.shape).reshape(-1)
-        return sparse.csr_matrix((entries.reshape(-1), indices, offsets), (3 * self.count, 3 * self.node_count))
-
-    @cached_property
-    def _jacobian_columns(self) -> sparse.csc_matrix:
-        return self.jacobian.T
-
-    @property
-    def dense_jacobian(self) -> np.ndarray:
-        """Dense (3n, 3N) contact Jacobian W."""
-        return self.jacobian.toarray()
-
-    def concatenate(self, others: ContactSet) -> ContactSet:
-        """Return these contacts followed by ``others`` of the same body."""
-        names = "points", "nodes", "weights", "axes", "gaps", "faces"
-        pairs = [(getattr(self, name), getattr(others, name)) for name in names]
-        return ContactSet(*map(np.concatenate, pairs), node_count=self.node_count)
-
-    @property
-    def nearest_nodes(self) -> np.ndarray:
-        """(n,) node with the largest weight of each point."""
-        return self.nodes[np.arange(self.count), np.argmax(self.weights, axis=1)]
-
-    def contact_velocities(self, velocities: np.ndarray) -> np.ndarray:
-        """Return W v for nodal velocities v (3N,) or (3N, k)."""
-        return self.jacobian @ velocities
-
-    def nodal_forces(self, forces: np.ndarray) -> np.ndarray:
-        """Return (3N,) newtons, W^T f for contact ``forces`` (n, 3)."""
-        return self._jacobian_columns @ forces.ravel()
-
-    def end_gaps(self, dt: float, velocities: np.ndarray) -> np.ndarray:
-        """Return (n,) m, the gaps after a step of ``dt`` seconds with nodal end velocities (N, 3). On uneven ground
-        they are measured to the tangent plane at the start.
-        """
-        return self.gaps + dt * self.contact_velocities(velocities.ravel())[0::3]
 
 
 def contact_geometry(
@@ -395,6 +325,37 @@ class ContactDetector:
             device=self.device,
         )
 
+    def gaps_of_worlds(self, positions: Any) -> tuple[Any, Any]:
+        """Evaluate the gaps of all points in c worlds, whose ``positions`` (c, N, 3) m are a tensor on the device.
+
+        Returns:
+            (c, P) m, the gaps, and (c, P) int32, the faces, tensors on the device.
+        """
+        gaps = positions.new_empty((len(positions), self.point_count))
+        faces = gaps.new_empty(gaps.shape, dtype=array_module(gaps).int32)
+        if len(positions) > 0:
+            self.enqueue_gaps(as_warp(positions.contiguous(), Vec3), as_warp(gaps, real), as_warp(faces, wp.int32))
+        return gaps, faces
+
+    def contact_sets(self, points: Any, counts: Any, positions: Any, start: Sequence[Any]) -> ContactSet:
+        """Return the contacts of c worlds as tensors on the device; this blocks until the device has finished.
+
+        Args:
+            points: (c, L) int32, points, of which each world uses its first ``counts`` (c,).
+            counts: int32.
+            positions: (c, N, 3) m, at the start of the step.
+            start: gaps (c, P) m and faces (c, P) there.
+        """
+        capacity = int(counts.max()) if len(counts) else 0
+        points = points[:, :capacity].contiguous()
+        nodes, faces = (points.new_empty((*points.shape, *size)) for size in ((4,), ()))
+        weights, axes, gaps = (positions.new_empty((*points.shape, *size)) for size in ((4,), (3, 3), ()))
+        if 0 not in points.shape:
+            inputs = (points, wp.int32), (counts, wp.int32), (positions, Vec3), (start[0], real), (start[1], wp.int32)
+            outputs = (nodes, wp.vec4i), (weights, Vec4), (axes, Mat33), (gaps, real), (faces, wp.int32)
+            self.enqueue_record(*([as_warp(contiguous(v), kind) for v, kind in each] for each in (inputs, outputs)))
+        return ContactSet(points, nodes, weights, axes, gaps, faces, positions.shape[1], counts)
+
     def contact_set(self, points: np.ndarray, positions: np.ndarray) -> ContactSet:
         """Return the contact set of ``points`` (n,); ``positions`` (N, 3) at the start of the step."""
         self.gaps(positions)
@@ -450,20 +411,6 @@ class _RecordBuffers:
     def read(self, count: int) -> list[np.ndarray]:
         """Return copies of the arrays after ``points`` of the first ``count`` contacts."""
         return [values[0, :count] for values in PinnedMirror.get_all(*self._host_arrays)]
-
-
-def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float, slop: float) -> np.ndarray:
-    """Return (n,) m/s, the terms of the normal measure c = N^T u' + max(phi, 0) / dt + max(min(phi + slop, 0) b / dt,
-    -cap) that do not depend on the velocity u' (docs/concepts/contact.md).
-
-    Args:
-        gaps: (n,) phi, m.
-        dt: step size, s.
-        cap: maximum push-out speed, m/s.
-        factor: b, fraction of the depth removed in a step.
-        slop: depth that is tolerated, m.
-    """
-    return np.maximum(gaps, 0.0) / dt + np.maximum(np.minimum(gaps + slop, 0.0) * factor / dt, -cap)
 
 
 def tangent_directions(count: int) -> np.ndarray:

@@ -13,10 +13,10 @@ from functools import cached_property
 
 import numpy as np
 
-from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.device_newton_workspace import FROM_BASE, FROM_TRIAL, NewtonWorkspace, TrialReadback
 from egs_warp.contact.device_step import SolveEnd, StepWorkspace
-from egs_warp.contact.newton import ContactLinearization, NewtonStepResult, PenetrationCheck
+from egs_warp.contact.newton import ContactLinearization, ContactLinearizer, NewtonStepResult, PenetrationCheck
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.contact.prefetch import ContactPrefetch
 from egs_warp.fem.body import SoftBody
@@ -32,10 +32,12 @@ _CAPACITY_STEP = 8
 """Contact capacities are multiples of this. Each capacity has buffers and graphs of its own."""
 
 
-class DeviceContactLinearizer(StepWorkspace):
+class DeviceContactLinearizer(StepWorkspace, ContactLinearizer):
     """Builds contact linearisations with the dense factors of one body on the device of its elements. Only the last
     linearisation, ``current``, can be used.
     """
+
+    is_on_host = False
 
     def __init__(self, factors: TiledCholesky, body: SoftBody, muscles: MuscleSet, prefetch: ContactPrefetch) -> None:
         super().__init__(factors, body, muscles, prefetch)

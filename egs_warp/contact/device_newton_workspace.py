@@ -1,6 +1,6 @@
 """Buffers and CUDA graphs of a step with contact on a GPU, where a round of Newton steps is one loop on the device.
 
-The kernels are in ``kernels/contact/iterate.py`` and ``kernels/contact/newton_convergence.py``. One vector holds an
+Trials are those of ``trial``; the rule of the loop is ``kernels/contact/newton_convergence.py``. One vector holds an
 iterate (see ``NewtonWorkspace.parts``). There are two, base and trial, and a start buffer that the host fills.
 
 A Newton loop is three graphs. ``_enqueue_loop_start`` copies the row of ``NewtonProgress`` and sets the loop condition.
@@ -20,19 +20,19 @@ import numpy as np
 import torch
 import warp as wp
 
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coulomb import FAILURE_TOLERANCE
-from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.device_coulomb import CoulombWorkspace
 from egs_warp.contact.device_step import StepWorkspace, vectors
 from egs_warp.contact.newton_convergence import NewtonProgress
+from egs_warp.contact.trial import NewtonDirection, Trial, TrialStep, enqueue_trial
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.kernels.contact import contacts as contact_kernels
 from egs_warp.kernels.contact import iterate as kernels
 from egs_warp.kernels.contact import newton_convergence as convergence_kernels
 from egs_warp.muscles.tension import MuscleEnergy
-from egs_warp.precision import Mat33, Vec3, Vec4, real
+from egs_warp.precision import Vec3, real
 
 FROM_BASE, FROM_TRIAL, FROM_START = 0.0, 1.0, 2.0
 """Slot that a trial starts from: the base as it is, the last trial, or the start buffer."""
@@ -78,13 +78,11 @@ class NewtonWorkspace:
         )
         self._indices = torch.zeros(5 * capacity, dtype=torch.int32, device=count.device)
         self._points, nodes = self._indices.split([capacity, 4 * capacity])
-        self._contacts = [
-            as_warp(nodes.view(-1, 4), wp.vec4i),
-            *(as_warp(weights.view(-1, 4), Vec4), as_warp(axes.view(-1, 3, 3), Mat33)),
-        ]
-        # The batch kernels take a leading world axis.
-        counts = wp.array([capacity], dtype=int, device=self._device)
-        self._batch_contacts = [counts, *(each.reshape((1, capacity)) for each in self._contacts)]
+        self._contacts = ContactSet(
+            *(self._points[None], nodes.view(1, -1, 4), weights.view(1, -1, 4), axes.view(1, -1, 3, 3), None, None),
+            *(self._node_count, torch.full((1,), capacity, dtype=torch.int32, device=count.device)),
+        )
+        """The uploaded contacts of one world. Padding has zero weights and counts as contacts."""
         self.columns = owner.zeros(size, width)
         self._right, self.delassus = owner.zeros(size, 3 + width), owner.zeros(width, width)
         self._host_delassus = owner.stream.pinned(width * width)
@@ -123,6 +121,15 @@ class NewtonWorkspace:
         self._base, self._trial = owner.zeros(3 * size + width), owner.zeros(3 * size + width)
         self.end_positions, self._gradient, self._residual, self._force_velocities = owner.zeros(4, size)
         self._torque = owner.zeros(3)
+        velocities, free_velocities, _, forces = self.parts(self._base)
+        self._direction = NewtonDirection(
+            *map(_one_world, (velocities, free_velocities, self._force_velocities, forces, self.target_forces))
+        )
+        velocities, _, free_residual, forces = self.parts(self._trial)
+        self._trial_record = Trial(
+            *(_one_world(velocities), _one_world(forces), _one_world(self.end_positions), _one_world(self._gradient)),
+            *(self._torque[None], _one_world(free_residual), _one_world(self._residual)),
+        )
         self._graphs = GraphCache(owner.stream)
         self.base_iterate: Any = None
         self.trial_iterate: Any = None
@@ -138,22 +145,12 @@ class NewtonWorkspace:
 
     def contact_velocities(self, velocities: torch.Tensor) -> torch.Tensor:
         """Return (3K, j) m/s, W v for nodal ``velocities`` v (3N, j)."""
-        out = velocities.new_empty((3 * self.capacity, velocities.shape[1]))
-        self._enqueue_contact_velocities(velocities, out)
-        return out
-
-    def _enqueue_contact_velocities(self, velocities: torch.Tensor, out: torch.Tensor) -> None:
-        self._launch(
-            contact_kernels.contact_velocities_kernel,
-            (1, self.capacity, velocities.shape[1]),
-            [*self._batch_contacts, as_warp(velocities[None], real)],
-            [as_warp(out[None], real)],
-        )
+        return self._contacts.contact_velocities(velocities[None])[0]
 
     def linearize(self, problem: StepProblem, contacts: ContactSet) -> None:
         """Linearise ``contacts`` with the current factors, asynchronously."""
         self.set_contacts(contacts)
-        self._run(self.enqueue_linearization, problem.dt, 1.0 + problem.dt * problem.drag)
+        self._run(self.enqueue_linearization, problem.dt, problem.inertia_ratio)
 
     def download_delassus(self) -> np.ndarray:
         """Return the (3K, 3K) m/(N s) Delassus operator that ``linearize`` has downloaded. The caller synchronises
@@ -195,7 +192,7 @@ class NewtonWorkspace:
             self.set_contacts(contacts)
             self.upload_start(tension, velocities, forces)
         self._upload_trial(0.0, False, forces, FROM_START)
-        readback = self._run_and_download(self._enqueue_predict, problem.dt, 1.0 + problem.dt * problem.drag)
+        readback = self._run_and_download(self._enqueue_predict, problem.dt, problem.inertia_ratio)
         return float(readback.residual_norm[0]), readback.velocities
 
     def _run(self, work: Callable[..., None], *args: Any) -> None:
@@ -208,17 +205,12 @@ class NewtonWorkspace:
         momenta, impulses = self._right[:, :3], self._right[:, 3:]
         torch.mul(owner.rotation_modes, owner.masses.repeat_interleave(3)[:, None], out=momenta)
         impulses.zero_()
-        self._launch(
-            contact_kernels.contact_jacobian_kernel,
-            (1, self.capacity),
-            self._batch_contacts,
-            [as_warp(impulses[None], real)],
-        )
+        self._contacts.jacobian_transposed(out=impulses[None])
         impulses.mul_(dt)
         solved = factors.enqueue_solve(self._right)
         factors.enqueue_momentum_projection(owner.rotation_modes, momenta, solved[:, :3], ratio)
         torch.addmm(solved[:, 3:], factors.rotation_response, factors.rotation_operator @ impulses, out=self.columns)
-        self._enqueue_contact_velocities(self.columns, self.delassus)
+        self._contacts.contact_velocities(self.columns[None], out=self.delassus[None])
         self.coulomb.enqueue_operator(self.delassus)
         self._host_delassus.copy_(self.delassus.view(-1), non_blocking=True)
 
@@ -239,7 +231,7 @@ class NewtonWorkspace:
         with self.owner.stream:
             self.upload_start(tension, velocities, forces)
             self._upload_trial(0.0, False, forces, FROM_START)
-            self._run(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
+            self._run(self._enqueue_trial, problem.dt, problem.inertia_ratio)
             self._trial_upload.start_copy()
 
     def upload_start(self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray) -> None:
@@ -255,7 +247,7 @@ class NewtonWorkspace:
         3) from the slot ``base``, and block until it is evaluated.
         """
         self._upload_trial(length, True, target_forces, base)
-        return self._run_and_download(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
+        return self._run_and_download(self._enqueue_trial, problem.dt, problem.inertia_ratio)
 
     def start_newton(
         self,
@@ -279,7 +271,7 @@ class NewtonWorkspace:
             base: slot to start from, ``FROM_BASE`` or ``FROM_TRIAL``.
             enabled: (1,) int32 on the device; 0 skips the loop. None always runs it.
         """
-        dt, ratio = problem.dt, 1.0 + problem.dt * problem.drag
+        dt, ratio = problem.dt, problem.inertia_ratio
         self.started, self.owner.last_solve = progress.row.copy(), None
         row = progress.row.copy()
         row[convergence_kernels.UNIT] = problem.residual_scale
@@ -393,7 +385,7 @@ class NewtonWorkspace:
             velocities: (N, 3) m/s, at the slot.
             base: slot at which the tangent is computed.
         """
-        owner, ratio = self.owner, 1.0 + problem.dt * problem.drag
+        owner, ratio = self.owner, problem.inertia_ratio
         with owner.stream:
             self._set_base(base)
             owner.factors.upload_diagonal(ratio * np.repeat(owner.body.node_mass, 3))
@@ -446,7 +438,7 @@ class NewtonWorkspace:
         """
         velocities, free_velocities, residual, _ = self.parts(state)
         self._enqueue_free_velocities(velocities, residual, free_velocities)
-        self._enqueue_contact_velocities(free_velocities[:, None], self.free_contact_velocities[:, None])
+        self._contacts.contact_velocities(free_velocities[None], out=self.free_contact_velocities[None])
 
     def _enqueue_free_velocities(self, velocities: torch.Tensor, residual: torch.Tensor, end: torch.Tensor) -> None:
         """Compute the velocities after a Newton step.
@@ -508,42 +500,25 @@ class NewtonWorkspace:
 
     def enqueue_residual(self, dt: float, ratio: float) -> None:
         """Compute the velocities, forces and residual of the trial in ``trial_input``."""
-        owner, nodes = self.owner, self._node_count
+        owner = self.owner
         self._enqueue_base()
-        velocities, _, free_residual, forces = self.parts(self._trial)
-        old, old_free_velocities, _, old_forces = self.parts(self._base)
-        lengths, target_forces = as_warp(self.trial_input[:1], real), self.target_forces
-        torch.mv(self.columns, target_forces, out=self._force_velocities)
+        torch.mv(self.columns, self.target_forces, out=self._force_velocities)
         self._force_velocities.mul_(self.trial_input[1])
-        self._launch(
-            kernels.trial_kernel,
-            nodes,
-            [
-                vectors(owner.positions),
-                dt,
-                lengths,
-                vectors(old),
-                vectors(old_free_velocities),
-                vectors(self._force_velocities),
-            ],
-            [vectors(velocities), vectors(self.end_positions)],
+        step = TrialStep(
+            *(dt, ratio, Vec3(*(float(each) for each in owner.body.gravity)), owner.masses),
+            *(_one_world(owner.positions), _one_world(owner.velocities), _one_world(owner.lever_arms)),
+            owner.inverse_inertia,
+            lambda *_: self._enqueue_internal(dt),
         )
-        self._launch(
-            kernels.trial_forces_kernel,
-            self.capacity,
-            [lengths, vectors(old_forces), vectors(target_forces)],
-            [vectors(forces)],
-        )
+        enqueue_trial(step, self._contacts, self.trial_input[:1], self._direction, self._trial_record)
+
+    def _enqueue_internal(self, dt: float) -> None:
+        """Compute the internal gradient and its torque at the end of the trial."""
+        owner = self.owner
         owner.enqueue_gradient(vectors(self.end_positions), dt, self._tensions, vectors(self._gradient))
         torch.mv(owner.rotation_modes.T, self._gradient, out=self._torque)
-        gravity = Vec3(*(float(each) for each in owner.body.gravity))
-        self._launch(
-            kernels.residual_kernel,
-            nodes,
-            [
-                *(as_warp(owner.masses, real), gravity, ratio, dt, vectors(owner.lever_arms)),
-                *(as_warp(owner.inverse_inertia.view(1, 3, 3), Mat33), vectors(owner.velocities), *self._contacts),
-                *(vectors(self._torque), vectors(self._gradient), vectors(velocities), vectors(forces)),
-            ],
-            [vectors(free_residual), vectors(self._residual)],
-        )
+
+
+def _one_world(flat: torch.Tensor) -> torch.Tensor:
+    """View a ``flat`` tensor (3n,) as vectors of one world (1, n, 3)."""
+    return flat.view(1, -1, 3)

@@ -13,19 +13,20 @@ import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.prefetch import ContactPrefetch
+from egs_warp.fem.batch_problem import enqueue_step_start
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
-from egs_warp.fem.step_problem import MIN_RELATIVE_STIFFNESS, StepProblem
+from egs_warp.fem.implicit_step import MIN_RELATIVE_STIFFNESS
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.fem.tiled_cholesky import TiledCholesky
 from egs_warp.fem.warp_elasticity import WarpElasticity
-from egs_warp.kernels.fem import step_start as kernels
 from egs_warp.launching import round_up
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy
-from egs_warp.precision import Mat33, Vec3, real
+from egs_warp.precision import Mat33, Vec3
 
 _CAPACITY_STEP = 64
 """Capacities for rank-one terms of the muscles' stiffness are multiples of this."""
@@ -119,21 +120,12 @@ class StepWorkspace:
 
     def _enqueue_start(self, dt: float) -> None:
         self._start_upload.send()
-        device = self.body.assembly.device
-        lanes = 1 if device.is_cpu else kernels.BLOCK
-        wp.launch(
-            kernels.step_start_kernel,
-            (1, lanes),
-            inputs=[dt, as_warp(self.masses, real), *map(_one_world, (self.positions, self.velocities))],
-            outputs=[
-                _one_world(self.lever_arms),
-                as_warp(self.rotation_modes[None], real),
-                as_warp(self.inverse_inertia, Mat33),
-                _one_world(self.rigid_guess),
-            ],
-            device=device,
-            block_dim=lanes,
+        by_world = (
+            each.view(1, -1, 3) for each in (self.positions, self.velocities, self.lever_arms, self.rigid_guess)
         )
+        positions, velocities, arms, guess = by_world
+        modes = self.rotation_modes[None]
+        enqueue_step_start(dt, self.masses, (positions, velocities), arms, modes, self.inverse_inertia, guess)
         self.elements.enqueue_start(vectors(self.positions), self.gradients)
         self._enqueue_ballistic(self.positions, self.velocities, dt, self.ballistic)
 
@@ -230,8 +222,3 @@ class StepWorkspace:
 def vectors(flat: torch.Tensor) -> wp.array:
     """View a ``flat`` tensor (3N,) as a Warp array of N vectors."""
     return as_warp(flat.view(-1, 3), Vec3)
-
-
-def _one_world(flat: torch.Tensor) -> wp.array:
-    """View a ``flat`` tensor (3N,) as a Warp array (1, N) of vectors."""
-    return as_warp(flat.view(1, -1, 3), Vec3)

@@ -6,12 +6,10 @@ step and evaluates the residual there; ``HostNewtonWorkspace.newton`` solves for
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
-from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.simd_elasticity import SimdElasticity
 from egs_warp.fem.step_problem import StepProblem, Tangent
@@ -97,7 +95,6 @@ class HostNewtonWorkspace:
         self._residual_at = address_of(residual)
         self._norm, self._norm_array = _shared(1)
         self._problem: StepProblem | None = None
-        self._contacts: tuple[ContactSet | None, list[Any], list[Any]] = (None, [], [])
 
     def trial(
         self,
@@ -137,7 +134,7 @@ class HostNewtonWorkspace:
                     self._step,
                     problem.damping.start,
                 ),
-                *(problem.dt, 1.0 + problem.dt * problem.drag, *self._contacts_of(base.contacts), columns),
+                *(problem.dt, problem.inertia_ratio, *base.contacts.addresses, columns),
                 *(base.velocities_at, base.free_velocities_at, base.forces_at, target_forces, float(length)),
             ],
             outputs=[
@@ -167,7 +164,7 @@ class HostNewtonWorkspace:
             inputs=[
                 *factor_arrays,
                 *low_rank_arrays,
-                *self._contacts_of(state.contacts),
+                *state.contacts.addresses,
                 right_side,
                 state.velocities_at,
             ],
@@ -182,16 +179,6 @@ class HostNewtonWorkspace:
         arrays["positions"][:], arrays["arms"][:] = state.positions.ravel(), problem.lever_arms.ravel()
         arrays["ballistic_velocities"][:] = (state.velocities + problem.dt * problem.body.gravity).ravel()
         arrays["inverse_inertia"][:], arrays["masses"][:] = problem.inverse_inertia.ravel(), problem.body.node_mass
-
-    def _contacts_of(self, contacts: ContactSet) -> list[Any]:
-        """Return the number of contacts and the addresses of their nodes, weights and axes."""
-        if self._contacts[0] is not contacts:
-            parts = [
-                np.ascontiguousarray(part, dtype=kind)
-                for part, kind in ((contacts.nodes, np.int32), (contacts.weights, float), (contacts.axes, float))
-            ]
-            self._contacts = contacts, parts, [contacts.count, *map(address_of, parts)]
-        return self._contacts[2]
 
 
 host_newton_workspace = thread_local_cache(4)(HostNewtonWorkspace)

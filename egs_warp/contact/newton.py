@@ -14,18 +14,13 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from egs_warp.contact.coulomb import coulomb_forces
-from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.coulomb import DELASSUS_REGULARIZATION, coulomb_forces, regularized
 from egs_warp.contact.host_newton import HostNewtonWorkspace, IterateBuffer, address_of, host_newton_workspace
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.muscles.tension import MuscleEnergy
-
-DELASSUS_REGULARIZATION = 1e-7
-"""Diagonal shift of the Delassus operator, as a fraction of the mean of its diagonal. The operator is singular if there
-are more points than the cage can resolve.
-"""
 
 
 @dataclass(frozen=True)
@@ -41,7 +36,7 @@ class ContactLinearization:
     def of(cls, tangent: Tangent, contacts: ContactSet, columns: np.ndarray | None = None) -> ContactLinearization:
         """Linearise ``contacts`` with ``tangent``; ``columns`` are computed unless they are passed."""
         if columns is None:
-            columns = tangent.solve(contacts.dense_jacobian.T)
+            columns = tangent.solve(contacts.jacobian_transposed())
             columns *= tangent.problem.dt
         return cls(tangent, contacts, columns)
 
@@ -57,9 +52,7 @@ class ContactLinearization:
 
     @cached_property
     def _regular(self) -> np.ndarray:
-        regular = self.delassus.copy()
-        regular[np.diag_indices_from(regular)] += DELASSUS_REGULARIZATION * regular.diagonal().mean()
-        return regular
+        return regularized(self.delassus, DELASSUS_REGULARIZATION)
 
     def solve_coulomb(
         self, speeds: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray
@@ -81,7 +74,7 @@ class ContactLinearization:
 
     def with_added_contacts(self, contacts: ContactSet) -> ContactLinearization:
         """Return the linearisation of ``contacts``, of which the first are the current ones, with the same tangent."""
-        new = contacts.dense_jacobian[3 * self.contacts.count :].T
+        new = contacts.jacobian_transposed()[:, 3 * self.contacts.count :]
         columns = np.hstack([self.columns, self.tangent.problem.dt * self.tangent.solve(new)])
         return ContactLinearization.of(self.tangent, contacts, columns)
 
@@ -90,12 +83,17 @@ class ContactLinearization:
         return NativeNewtonIterate.at(self, tension, velocities, forces)
 
 
-class ContactLinearizer(Protocol):
-    """Protocol of the objects that build the contact linearisations of one body."""
+class ContactLinearizer:
+    """Builder of the contact linearisations of one body, with NumPy arrays on the host. ``DeviceContactLinearizer`` is
+    the one on a GPU.
+    """
+
+    is_on_host = True
+    """False if matrices and gaps are on a GPU."""
 
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> ContactLinearization:
         """Linearise ``contacts`` with ``tangent``."""
-        ...
+        return ContactLinearization.of(tangent, contacts)
 
     def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
         """Select the contacts of a step where the gaps are on a GPU.
@@ -108,50 +106,13 @@ class ContactLinearizer(Protocol):
         Returns:
             The contacts; None if the gaps are on the host.
         """
-        ...
-
-    def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray, loaded: np.ndarray) -> None:
-        """Start ``select_contacts`` for the probable next step, of ``dt`` seconds from ``state``; ``before`` (m,) are
-        the contact points of the step that ends there, and ``loaded`` (m,) is True for those that carry load.
-        """
-        ...
-
-    def predict_velocities(
-        self,
-        tangent: Tangent,
-        contacts: ContactSet,
-        tension: MuscleEnergy | None,
-        velocities: np.ndarray,
-        forces: np.ndarray,
-    ) -> np.ndarray | None:
-        """Take one Newton step with fixed contact forces.
-
-        Args:
-            tangent: factored tangent.
-            contacts: n contacts.
-            tension: muscle energy of the step, or None.
-            velocities: (N, 3) m/s, initial velocities.
-            forces: (n, 3) newtons.
-
-        Returns:
-            (N, 3) m/s; None if the step inverts an element.
-        """
-        ...
-
-
-class HostContactLinearizer:
-    """``ContactLinearizer`` with NumPy arrays."""
-
-    def __call__(self, tangent: Tangent, contacts: ContactSet) -> ContactLinearization:
-        """Linearise ``contacts`` with ``tangent``."""
-        return ContactLinearization.of(tangent, contacts)
-
-    def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
-        """Return None; the caller selects contacts on the host."""
         return None
 
     def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray, loaded: np.ndarray) -> None:
-        """Do nothing; there is no device to work in parallel."""
+        """Start ``select_contacts`` for the probable next step, of ``dt`` seconds from ``state``, if the gaps are on a
+        GPU; ``before`` (m,) are the contact points of the step that ends there, and ``loaded`` (m,) is True for those
+        that carry load.
+        """
 
     def predict_velocities(
         self,
@@ -163,6 +124,16 @@ class HostContactLinearizer:
     ) -> np.ndarray | None:
         """Take one Newton step with fixed contact forces. This needs one right-hand side; a linearisation needs three
         for each contact.
+
+        Args:
+            tangent: factored tangent.
+            contacts: n contacts.
+            tension: muscle energy of the step, or None.
+            velocities: (N, 3) m/s, initial velocities.
+            forces: (n, 3) newtons.
+
+        Returns:
+            (N, 3) m/s; None if the step inverts an element.
         """
         problem, workspace = tangent.problem, host_newton_workspace(contacts.node_count)
         state = IterateBuffer.of(contacts, velocities, forces)

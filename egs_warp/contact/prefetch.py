@@ -11,7 +11,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.contact.detection import ContactDetector, ContactSet
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.detection import ContactDetector
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphCache, GraphStream, PinnedUpload

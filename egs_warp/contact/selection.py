@@ -9,7 +9,9 @@ import numpy as np
 import warp as wp
 from scipy.spatial import KDTree
 
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.detection import ContactGeometry
+from egs_warp.fem.batched import as_warp, padded
 from egs_warp.geometry.tetmesh import mean_edge_length
 from egs_warp.kernels.contact import selection as kernels
 from egs_warp.launching import PinnedMirror, copy_into, grow_capacity, launch_cached, zeros
@@ -198,13 +200,49 @@ class ContactSelector:
             self._buffers = _SelectionBuffers(self, grow_capacity(count))
         return self._buffers
 
-    @staticmethod
-    def transfer_forces(points: np.ndarray, before: np.ndarray, forces: np.ndarray) -> np.ndarray:
-        """Map ``forces`` (m, 3) at the points ``before`` (m,) to ``points`` (n,); they are zero for new points."""
-        matched = np.zeros((len(points), 3))
-        now, then = np.nonzero(points[:, None] == before)
-        matched[now] = forces[then]
-        return matched
+    def select_in_worlds(self, previous: Sequence[Any], gaps: Any) -> tuple[Any, Any]:
+        """Select the points of the next step in c worlds; all arrays are tensors on the device.
+
+        Args:
+            previous: points (c, L) int32 of the previous step, their counts (c,) int32, and (c, L) int32, 1 for those
+                that carried load.
+            gaps: (c, P) m, at the predicted end of the step.
+
+        Returns:
+            (c, L + C) int32 points, and (c,) int32 counts.
+        """
+        before, capacity = previous[1], previous[0].shape[1] + self.cell_count
+        lowest, *arrays = (before.new_zeros((len(gaps), n)) for n in (self.cell_count, capacity, capacity))
+        candidates, points, counts = *arrays, before.new_zeros(len(before))
+        if len(gaps) > 0:
+            work, selected = _arrays(wp.int32, lowest, candidates), _arrays(wp.int32, points, counts)
+            self.enqueue_selection(_arrays(wp.int32, *previous), as_warp(gaps, real), work, selected)
+        return points, counts
+
+    def find_penetrating_in_worlds(self, contacts: ContactSet, gaps: Sequence[Any], tolerance: float) -> Any:
+        """Return (c, C) int32, the deepest point of each cell that would end too deep and is not in ``contacts``, or
+        -1; ``gaps`` (c, P) m at the end and at the start of the step, penetration ``tolerance`` m.
+        """
+        found = gaps[0].new_zeros(len(contacts.counts))
+        lowest = contacts.counts[:, None].repeat(1, self.cell_count)
+        if len(found) > 0:
+            inputs = _arrays(wp.int32, contacts.points, contacts.counts), _arrays(real, *gaps)
+            self.enqueue_penetrating(*inputs, tolerance, [*_arrays(real, found), *_arrays(wp.int32, lowest)])
+        return lowest
+
+    def append_in_worlds(self, contacts: ContactSet, lowest: Any, gaps: Any) -> tuple[Any, Any]:
+        """Append the points in ``lowest`` (c, C) that are not negative, those with the smallest ``gaps`` (c, P) in
+        metres first; return the points (c, K) and their counts (c,). There is at least one world.
+        """
+        points, counts = padded(contacts.points, self.cell_count), contacts.counts.clone()
+        inputs = as_warp(lowest.contiguous(), wp.int32), as_warp(gaps.contiguous(), real)
+        self.enqueue_append(*inputs, _arrays(wp.int32, points, counts))
+        return points, counts
+
+
+def _arrays(kind: Any, *tensors: Any) -> list[wp.array]:
+    """Return Warp arrays that share the memory of the ``tensors``, or of copies of those that are not contiguous."""
+    return [as_warp(each.contiguous(), kind) for each in tensors]
 
 
 class _SelectionBuffers:
@@ -226,8 +264,8 @@ class _SelectionBuffers:
 
     def write(self, points: np.ndarray, loaded: np.ndarray) -> None:
         """Upload ``points`` (m,) of the previous step, and whether they are ``loaded`` (m,)."""
-        for padded, values in zip(self._padded, (points, loaded), strict=True):
-            padded[0, : len(values)] = values
+        for target, values in zip(self._padded, (points, loaded), strict=True):
+            target[0, : len(values)] = values
         for mirror, values in zip(
             self._inputs, (self._padded[0], np.array([len(points)]), self._padded[1]), strict=True
         ):

@@ -1,24 +1,25 @@
-"""Batched version of ``StepProblem`` and its ``Tangent``: many worlds in one set of device tensors (Eq. 4, 6)."""
+"""The implicit Euler steps of many worlds of one body, in one set of tensors, and their tangents (Eq. 4, 6)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.fem.batched import BatchedRecord, as_warp, launch_on, nonzero
-from egs_warp.fem.body import SoftBody
+from egs_warp.fem.batched import as_warp, launch_on, nonzero
+from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.implicit_step import MIN_RELATIVE_STIFFNESS, ImplicitStep
 from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.fem.panel_cholesky import CHUNK_BYTES, PANEL, PanelCholesky
-from egs_warp.fem.step_problem import MIN_RELATIVE_STIFFNESS
 from egs_warp.fem.warp_elasticity import MuscleSegmentMaps, WarpElasticity
 from egs_warp.kernels.fem import step_start as kernels
 from egs_warp.muscles.muscle_set import MuscleSet
-from egs_warp.muscles.tension import force_length_factor
+from egs_warp.muscles.tension import segment_stiffnesses
 from egs_warp.precision import Mat33, Vec3, real
 
 _MIN_LENGTH = 1e-300
@@ -82,8 +83,7 @@ class BatchBody:
         vectors = rows @ positions
         lengths = vectors.norm(dim=2).clamp(min=_MIN_LENGTH)
         directions = vectors / lengths[:, :, None]
-        share, _, slope = force_length_factor(lengths / rest_lengths)
-        across, stretch = tensions * share / lengths, tensions * slope / rest_lengths
+        across, stretch = segment_stiffnesses(tensions, lengths, rest_lengths)
         largest = torch.maximum(across.abs(), stretch.abs()).amax(dim=1, keepdim=True).clamp(min=_MIN_LENGTH)
         across, stretch = (
             torch.where(rate.abs() > MIN_RELATIVE_STIFFNESS * largest, rate, 0.0) for rate in (across, stretch)
@@ -98,23 +98,18 @@ class BatchBody:
                     blocks[:, :, k, :, i] += part
 
 
-@dataclass(frozen=True)
-class BatchProblem(BatchedRecord):
-    """The implicit step of c worlds; its members have the same names and meanings as in ``StepProblem``."""
+@dataclass(frozen=True, kw_only=True)
+class BatchProblem(ImplicitStep):
+    """The implicit steps of c worlds, in tensors on their device."""
 
-    body: BatchBody
-    dt: float
-    """Step size, s."""
-    drag: float
-    """alpha of the Rayleigh damping, 1/s."""
+    worlds: BatchBody
+    """Data that the worlds share."""
     slots: torch.Tensor
     """(c,) slot of each world's factors, ascending."""
-    positions: torch.Tensor
-    """(c, N, 3) m, nodal positions at the start of the step."""
-    velocities: torch.Tensor
-    """(c, N, 3) m/s, nodal velocities at the start of the step."""
     start_gradients: torch.Tensor
     """(c, T, 3, 3) deformation gradients at the start of the step."""
+    lever_arms: torch.Tensor
+    """(c, N, 3) m, positions relative to the centre of mass."""
     rotation_modes: torch.Tensor
     """(c, 3N, 3) m, nodal velocities e_k x r of unit rotations about the centre of mass."""
     inverse_inertia: torch.Tensor
@@ -146,63 +141,52 @@ class BatchProblem(BatchedRecord):
         modes = positions.new_empty(len(positions), 3 * len(common.mass), 3)
         inverse_inertia = positions.new_empty(len(positions), 3, 3)
         arms, guess = torch.empty_like(positions), torch.empty_like(positions)
-        lanes = 1 if common.elements.device.is_cpu else kernels.BLOCK
-        launch_on(
-            common.device,
-            kernels.step_start_kernel,
-            (len(positions), lanes),
-            inputs=[dt, (common.mass, real), (positions, Vec3), (velocities, Vec3)],
-            outputs=[(arms, Vec3), (modes, real), (inverse_inertia, Mat33), (guess, Vec3)],
-            block_dim=lanes,
-        )
+        enqueue_step_start(dt, common.mass, (positions, velocities), arms, modes, inverse_inertia, guess)
         gradients = positions.new_empty(len(positions), len(common.body.mesh.tets), 3, 3)
         common.elements.enqueue_start(as_warp(positions, Vec3), as_warp(gradients, Mat33))
-        return cls(common, dt, drag, slots, positions, velocities, gradients, modes, inverse_inertia, guess)
+        state: Any = positions, velocities
+        return cls(
+            *(common.body, BodyState(*state), dt, drag),
+            worlds=common,
+            slots=slots,
+            start_gradients=gradients,
+            lever_arms=arms,
+            rotation_modes=modes,
+            inverse_inertia=inverse_inertia,
+            rigid_guess=guess,
+        )
 
     @property
-    def momenta(self) -> torch.Tensor:
-        """Return the angular momenta (c, 3, 3N) of unit nodal velocities about the centre of mass."""
-        return (self.rotation_modes * self.body.mass.repeat_interleave(3)[:, None]).mT
+    def node_mass(self) -> torch.Tensor:
+        """(N,) kg, lumped masses."""
+        return self.worlds.mass
 
     @property
-    def residual_scale(self) -> float:
-        """dt times the weight, N s, the unit of residual norms."""
-        return self.dt * self.body.body.weight
-
-    @property
-    def inertia_ratio(self) -> float:
-        """Factor 1 + dt alpha of the mass in the step's equation."""
-        return 1.0 + self.dt * self.drag
-
-    def end_positions(self, velocities: torch.Tensor) -> torch.Tensor:
-        """Return x + dt v (c, N, 3), m."""
-        return self.positions + self.dt * velocities
+    def gravity(self) -> torch.Tensor:
+        """(3,) m/s^2."""
+        return self.worlds.gravity
 
     def is_inversion_free(self, velocities: torch.Tensor) -> torch.Tensor:
         """Return, for each world, True if no element is inverted at the end positions of ``velocities``: (c,) bool."""
-        _, determinants = self.body.elements.enqueue_energies(as_warp(self.end_positions(velocities), Vec3), None, 0.0)
+        _, determinants = self.worlds.elements.enqueue_energies(
+            as_warp(self.end_positions(velocities), Vec3), None, 0.0
+        )
         return wp.to_torch(determinants)[: len(velocities)].amin(dim=1) > 0.0
 
-    def internal_gradient(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
-        """Return minus the internal forces (c, N, 3) N at the end of the step, with muscle ``tensions`` (c, M) N."""
-        gradient, body = torch.empty_like(velocities), self.body
-        segments, loads = (None, None) if tensions is None else (body.segments, as_warp(tensions, real))
-        end = as_warp(self.end_positions(velocities), Vec3)
-        start = as_warp(self.start_gradients, Mat33)
-        body.elements.enqueue_gradient(end, start, self.dt, segments, as_warp(gradient, Vec3), loads)
+    def internal_gradient(self, velocities: torch.Tensor, tension: torch.Tensor | None) -> torch.Tensor:
+        """Return minus the internal forces (c, N, 3) N at the end of the step, with muscle tensions (c, M) N."""
+        gradient = torch.empty_like(velocities)
+        self.enqueue_gradient(self.end_positions(velocities), tension, gradient)
         return gradient
 
-    def momentum_correction(self, internal_gradient: torch.Tensor) -> torch.Tensor:
-        """Return the angular velocity (c, 3) rad/s that the projection P^T restores (``StepProblem``)."""
-        torque = self.rotation_modes.mT @ internal_gradient.flatten(1)[:, :, None]
-        return self.dt * (self.inverse_inertia @ torque)[:, :, 0]
-
-    def residual(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
-        """Return the residual (c, N, 3) N s of the step's equation without contact forces."""
-        internal = self.internal_gradient(velocities, tensions)
-        correction = (self.rotation_modes @ self.momentum_correction(internal)[:, :, None]).view_as(velocities)
-        change = self.inertia_ratio * velocities - self.velocities - self.dt * self.body.gravity - correction
-        return self.body.mass[:, None] * change + self.dt * internal
+    def enqueue_gradient(self, ends: torch.Tensor, tension: torch.Tensor | None, gradient: torch.Tensor) -> None:
+        """Write minus the internal forces at the end positions ``ends`` (c, N, 3) to ``gradient``, as
+        ``internal_gradient``.
+        """
+        worlds = self.worlds
+        segments, loads = (None, None) if tension is None else (worlds.segments, as_warp(tension, real))
+        arrays = as_warp(ends, Vec3), as_warp(self.start_gradients, Mat33), as_warp(gradient, Vec3)
+        worlds.elements.enqueue_gradient(*arrays[:2], self.dt, segments, arrays[2], loads)
 
     def factor(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
         """Factor the derivative of the residual, or a positive definite approximation of it, into the worlds' slots.
@@ -218,7 +202,7 @@ class BatchProblem(BatchedRecord):
         """
         factored = [
             self._factor(slice(part.start, part.stop), velocities, tensions)
-            for part in self.body.factors.chunks(len(velocities))
+            for part in self.worlds.factors.chunks(len(velocities))
         ]
         return torch.cat(factored)
 
@@ -228,13 +212,13 @@ class BatchProblem(BatchedRecord):
         part_tensions = None if tensions is None else tensions[part]
         factored = torch.zeros(len(end), dtype=torch.bool, device=end.device)
         remaining = torch.arange(len(end), device=end.device)
-        diagonal = self.inertia_ratio * self.body.mass.repeat_interleave(3)
+        diagonal = self.inertia_ratio * self.coordinate_mass
         # Try the matrix with the muscles' stiffness, then without it, then with the projected Hessian, which is
         # positive definite.
         for muscles, projected in ((True, False), (False, False), (False, True)):
             if (muscles and part_tensions is None) or len(remaining) == 0:
                 continue
-            entries = self.body.elements.enqueue_entries(
+            entries = self.worlds.elements.enqueue_entries(
                 as_warp(end[remaining], Vec3),
                 as_warp(gradients[remaining], Mat33),
                 self.dt,
@@ -244,26 +228,45 @@ class BatchProblem(BatchedRecord):
             stiffness = None
             if muscles and part_tensions is not None:
                 stiffness = partial(
-                    self.body.add_muscle_stiffness,
+                    self.worlds.add_muscle_stiffness,
                     positions=end[remaining],
                     tensions=part_tensions[remaining],
                     factor=self.dt**2,
                 )
-            factors = self.body.factors
+            factors = self.worlds.factors
             factors.factor(wp.to_torch(entries)[: len(remaining)], diagonal, slots[remaining], stiffness)
             factored[remaining] = factors.status[slots[remaining]] == FactorStatus.DEFINITE
             remaining = nonzero(~factored)
         return factored
 
 
-@dataclass(frozen=True, eq=False)
-class BatchMomentumProjection(MomentumProjection, BatchedRecord):
-    """``MomentumProjection`` of c worlds."""
+def enqueue_step_start(
+    dt: float,
+    mass: torch.Tensor,
+    state: tuple[torch.Tensor, torch.Tensor],
+    arms: torch.Tensor,
+    modes: torch.Tensor,
+    inverse_inertia: torch.Tensor,
+    guess: torch.Tensor,
+) -> None:
+    """Write the values at the start of steps of ``dt`` seconds: lever arms (c, N, 3), rotation modes (c, 3N, 3),
+    inverse inertia (c, 3, 3) and rigid guess (c, N, 3), for the ``mass`` (N,) of the nodes and the ``state``, positions
+    and velocities (c, N, 3).
+    """
+    lanes = kernels.BLOCK if arms.is_cuda else 1
+    launch_on(
+        arms,
+        kernels.step_start_kernel,
+        (len(arms), lanes),
+        inputs=[dt, (mass, real), *((each, Vec3) for each in state)],
+        outputs=[(arms, Vec3), (modes, real), (inverse_inertia, Mat33), (guess, Vec3)],
+        block_dim=lanes,
+    )
 
 
 def apply_inverse(
-    problem: BatchProblem, impulses: torch.Tensor, projection: BatchMomentumProjection | None = None
-) -> tuple[torch.Tensor, BatchMomentumProjection]:
+    problem: BatchProblem, impulses: torch.Tensor, projection: MomentumProjection | None = None
+) -> tuple[torch.Tensor, MomentumProjection]:
     """Return the velocity changes J^-1 ``impulses`` and the momentum projection that was used.
 
     Args:
@@ -274,17 +277,10 @@ def apply_inverse(
     Returns:
         (c, 3N, m) m/s, and the momentum projection.
     """
-    factors = problem.body.factors
+    factors = problem.worlds.factors
     if projection is not None:
         return factors.solve(impulses, problem.slots, projection), projection
     momenta = problem.momenta.mT.contiguous()
     both = factors.solve(torch.cat([momenta, impulses], dim=2), problem.slots)
-    projection = BatchMomentumProjection.of(
-        problem.rotation_modes, momenta, problem.inertia_ratio, both[:, :, :3].contiguous(), _inverse
-    )
+    projection = problem.momentum_projection(momenta, both[:, :, :3].contiguous())
     return projection.corrected(impulses, both[:, :, 3:]), projection
-
-
-def _inverse(matrices: torch.Tensor) -> torch.Tensor:
-    """Return the inverses of ``matrices``, not finite for singular ones; an exception would stop all worlds."""
-    return torch.linalg.inv_ex(matrices).inverse

@@ -1,18 +1,27 @@
-"""Batches of worlds: records whose tensors have a leading world axis, and kernel launches over such tensors."""
+"""Arrays of one world or of many: records with a leading world axis, and kernel launches in the memory of NumPy arrays
+or PyTorch tensors.
+
+PyTorch is not imported, so that one world on a CPU does not need it.
+"""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-import torch
 import warp as wp
+
+from egs_warp.launching import launch_cached
+
+if TYPE_CHECKING:
+    import torch
 
 
 @dataclass(frozen=True)
 class BatchedRecord:
-    """Record of c worlds: each of its tensors, also in nested records, has one row per world."""
+    """Record of c worlds: each of its arrays, also in nested records, has one row per world."""
 
     def gather(self, worlds: torch.Tensor) -> Self:
         """Return a record of the given ``worlds`` (k,), in their order."""
@@ -32,18 +41,31 @@ class BatchedRecord:
             elif rows is not value:  # Records of all worlds may share a tensor, see ``subset``.
                 value[worlds] = rows
 
+    def download(self) -> list[Self]:
+        """Return the record of each world on the host, with NumPy arrays and Python's numbers."""
+        columns = {
+            name: value.download() if isinstance(value, BatchedRecord) else _rows_on_host(value)
+            for name, value in self.batched_fields()
+        }
+        rows = zip(*columns.values(), strict=True)
+        return [replace(self, **dict(zip(columns, row, strict=True))) for row in rows]
+
     def batched_fields(self) -> list[tuple[str, Any]]:
-        """Return names and values of the fields that have a world axis."""
+        """Return names and values of the fields that are arrays or records of arrays."""
         values = [(field.name, getattr(self, field.name)) for field in fields(self)]
-        return [(name, value) for name, value in values if isinstance(value, torch.Tensor | BatchedRecord)]
+        return [(name, value) for name, value in values if isinstance(value, BatchedRecord) or hasattr(value, "ndim")]
 
 
 def _rows(value: Any, worlds: torch.Tensor) -> Any:
     return value.gather(worlds) if isinstance(value, BatchedRecord) else value[worlds]
 
 
+def _rows_on_host(value: torch.Tensor) -> list[Any]:
+    return value.tolist() if value.ndim == 1 else list(value.cpu().numpy())
+
+
 def _count(value: Any) -> int:
-    return len(value) if isinstance(value, torch.Tensor) else _count(next(iter(value.batched_fields()))[1])
+    return _count(next(iter(value.batched_fields()))[1]) if isinstance(value, BatchedRecord) else len(value)
 
 
 def nonzero(mask: torch.Tensor) -> torch.Tensor:
@@ -51,18 +73,34 @@ def nonzero(mask: torch.Tensor) -> torch.Tensor:
     return mask.nonzero().squeeze(1)
 
 
-def repeat_offsets(offsets: np.ndarray, count: int, step: int, device: torch.device) -> torch.Tensor:
-    """Repeat the index map ``offsets`` (m, ...) ``count`` times, adding ``step`` per copy: (count m, ...) int32.
+def array_module(values: Any) -> Any:
+    """Return the module, NumPy or PyTorch, whose functions take ``values``."""
+    return np if isinstance(values, np.ndarray) else sys.modules["torch"]
 
-    Negative entries, which mean "none", are unchanged.
-    """
-    first = torch.as_tensor(np.asarray(offsets, dtype=np.int32), device=device)
-    shifts = step * torch.arange(count, dtype=torch.int32, device=device).reshape(-1, *[1] * first.ndim)
-    return torch.where(first < 0, first, first + shifts).flatten(0, 1)
+
+def empty_like(values: Any, shape: tuple[int, ...]) -> Any:
+    """Return an uninitialized array of ``shape``, otherwise like ``values``, a NumPy array or a tensor."""
+    return np.empty(shape, values.dtype) if isinstance(values, np.ndarray) else values.new_empty(shape)
+
+
+def padded(values: Any, more: int) -> Any:
+    """Pad ``values`` (c, K, ...), a tensor, with ``more`` zeros along the second axis."""
+    if not more:
+        return values
+    wide = values.new_zeros((len(values), values.shape[1] + more, *values.shape[2:]))
+    wide[:, : values.shape[1]] = values
+    return wide
+
+
+def contiguous(values: Any) -> Any:
+    """Return ``values``, or a contiguous copy; a NumPy array is also converted to int32 or float64."""
+    if isinstance(values, np.ndarray):
+        return np.ascontiguousarray(values, np.int32 if values.dtype.kind == "i" else np.float64)
+    return values.contiguous()
 
 
 def launch_on(
-    device: torch.device,
+    target: Any,
     kernel: Any,
     dim: int | tuple[int, ...],
     *,
@@ -70,24 +108,29 @@ def launch_on(
     outputs: list[Any],
     block_dim: int = 256,
 ) -> None:
-    """Launch ``kernel`` on ``device``.
+    """Launch ``kernel`` where ``target`` is.
 
     Args:
-        device: device of all tensors.
+        target: an array, or the device of all tensors.
         kernel: the Warp kernel.
         dim: launch dimensions.
-        inputs: arguments; a tensor is passed as a pair of the contiguous tensor and the element type of the array.
+        inputs: arguments; an array or tensor is passed as a pair of itself, contiguous, and the element type.
         outputs: output arguments, likewise.
         block_dim: threads per block.
     """
-    target = wp.device_from_torch(device)
     input_arrays, output_arrays = ([_array(value) for value in values] for values in (inputs, outputs))
-    wp.launch(kernel, dim, inputs=input_arrays, outputs=output_arrays, device=target, block_dim=block_dim)
+    if isinstance(target, np.ndarray):
+        launch_cached(kernel, dim, inputs=input_arrays, outputs=output_arrays, device=wp.get_device("cpu"))
+        return
+    device = wp.device_from_torch(getattr(target, "device", target))
+    wp.launch(kernel, dim, inputs=input_arrays, outputs=output_arrays, device=device, block_dim=block_dim)
 
 
-def as_warp(tensor: torch.Tensor, dtype: Any) -> wp.array:
-    """Return a Warp array that shares the memory of ``tensor``."""
-    return wp.from_torch(tensor, dtype=dtype)
+def as_warp(values: Any, dtype: Any) -> wp.array:
+    """Return a Warp array that shares the memory of ``values``, a tensor or a NumPy array."""
+    if isinstance(values, np.ndarray):
+        return wp.array(values, dtype=dtype, device="cpu", copy=False)
+    return wp.from_torch(values, dtype=dtype)
 
 
 def _array(value: Any) -> Any:

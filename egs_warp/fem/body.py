@@ -12,6 +12,7 @@ import scipy.sparse.linalg as sparse_linalg
 
 from egs_warp.errors import ArgumentError
 from egs_warp.fem.assembly_topology import Material
+from egs_warp.fem.batched import BatchedRecord
 from egs_warp.fem.elasticity import ElasticAssembly
 from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.geometry.plane import Plane
@@ -118,8 +119,8 @@ class SoftBody:
 
 
 @dataclass(frozen=True)
-class BodyState:
-    """Positions and velocities of the nodes at one point in time."""
+class BodyState(BatchedRecord):
+    """Positions and velocities of the nodes at one point in time; those of c worlds are tensors (c, N, 3)."""
 
     __repr__ = short_repr
 

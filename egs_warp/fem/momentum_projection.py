@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 
+from egs_warp.fem.batched import BatchedRecord, array_module
+
 
 @dataclass(frozen=True, eq=False)
-class MomentumProjection:
+class MomentumProjection(BatchedRecord):
     """Correction by rigid rotations that gives solutions the angular momenta of their right-hand sides.
 
     Arrays are NumPy arrays or PyTorch tensors, also with a leading world axis.
@@ -34,10 +35,13 @@ class MomentumProjection:
         mode_momenta: Any,
         inertia_ratio: float,
         rotation_response: Any,
-        invert: Callable[[Any], Any] = np.linalg.inv,
     ) -> Self:
-        """Build the projection; ``invert`` returns the inverses of 3 x 3 matrices."""
-        inverse = invert(inertia_ratio * mode_momenta.swapaxes(-1, -2) @ rotation_response)
+        """Build the projection. Of worlds, a singular matrix has an inverse that is not finite; an exception would stop
+        all worlds.
+        """
+        matrix = inertia_ratio * mode_momenta.swapaxes(-1, -2) @ rotation_response
+        linalg = array_module(matrix).linalg
+        inverse = linalg.inv(matrix) if linalg is np.linalg else linalg.inv_ex(matrix).inverse
         return cls(rotation_modes, mode_momenta, inertia_ratio, rotation_response, inverse)
 
     def corrected(self, right: Any, plain: Any) -> Any:

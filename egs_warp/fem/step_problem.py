@@ -1,4 +1,4 @@
-"""One implicit Euler step as an equation for the end velocities that conserves both momenta (Eq. 4, 6)."""
+"""The implicit Euler step of one world, and its tangent (Eq. 4, 6)."""
 
 from __future__ import annotations
 
@@ -9,41 +9,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.assembly_topology import Damping
-from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.body import BodyState
+from egs_warp.fem.implicit_step import MIN_RELATIVE_STIFFNESS, UNSOLVABLE, ImplicitStep, UnsolvableStepError
 from egs_warp.fem.linear_solver import FactorStatus, LinearSolver
 from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.geometry.frames import cross_matrices
 from egs_warp.muscles.tension import MuscleEnergy
 
-UNSOLVABLE = "the tangent is singular or not finite"
-MIN_RELATIVE_STIFFNESS = 1e-3
-"""Fraction of the largest T / L of the muscles below which a stiffness is left out of the tangent."""
-
-
-class UnsolvableStepError(ArithmeticError):
-    """The equations of a step cannot be solved."""
-
 
 @dataclass(frozen=True)
-class StepProblem:
-    """One implicit step: M (v - v0) + dt alpha M v = dt (P^T f(x + dt v) + M g + f_contact), with the forces f of
-    elasticity, damping and muscles.
-
-    Implicit Euler alone loses angular momentum: with x+ = x + dt v the momentum changes by dt sum r x f, with the lever
-    arms r at the *start* of the step, about which the internal forces at its end have a torque. P^T removes that torque
-    as the inertial force of a rigid rotation, M (w x r): P v is v minus the rigid rotation with v's angular momentum.
-    So L+ = L + dt sum r x (f_contact - alpha M v) holds up to rounding, contact velocities are those that are solved
-    for, and ``momentum_correction`` is the angular velocity w of the removed rotation.
-    """
-
-    body: SoftBody
-    """The body."""
-    state: BodyState
-    """State at the start of the step."""
-    dt: float
-    """Step size, s."""
-    drag: float = 0.0
-    """alpha of the Rayleigh damping (air drag), 1/s."""
+class StepProblem(ImplicitStep):
+    """The implicit step of one world, in NumPy arrays."""
 
     def starts_from(self, state: BodyState, dt: float) -> bool:
         """Return True if this is the step of ``dt`` seconds from the same ``state`` object."""
@@ -54,10 +30,15 @@ class StepProblem:
         """Damping of the step."""
         return self.body.assembly.damping(self.state.positions, self.dt)
 
-    @cached_property
-    def mass(self) -> np.ndarray:
-        """(N, 1) kg, lumped masses."""
-        return self.body.node_mass[:, None]
+    @property
+    def node_mass(self) -> np.ndarray:
+        """(N,) kg, lumped masses."""
+        return self.body.node_mass
+
+    @property
+    def gravity(self) -> np.ndarray:
+        """(3,) m/s^2."""
+        return self.body.gravity
 
     @cached_property
     def rotation_modes(self) -> np.ndarray:
@@ -68,12 +49,6 @@ class StepProblem:
     def lever_arms(self) -> np.ndarray:
         """(N, 3) m, positions relative to the centre of mass at the start of the step."""
         return self.state.positions - self.body.centre_of_mass(self.state.positions)
-
-    @cached_property
-    def momenta(self) -> np.ndarray:
-        """(3, 3N) kg m, matrix that maps nodal velocities to the angular momentum about the centre of mass, with lever
-        arms r."""
-        return (self.rotation_modes * np.repeat(self.body.node_mass, 3)[:, None]).T
 
     @cached_property
     def inertia(self) -> np.ndarray:
@@ -89,20 +64,6 @@ class StepProblem:
     def angular_momentum(self) -> np.ndarray:
         """(3,) kg m^2/s, angular momentum about the centre of mass at the start of the step."""
         return self.body.angular_momentum(self.state.positions, self.state.velocities)
-
-    @property
-    def inertia_ratio(self) -> float:
-        """Factor 1 + dt alpha of the mass in the equation."""
-        return 1.0 + self.dt * self.drag
-
-    @property
-    def residual_scale(self) -> float:
-        """dt times the weight, N s, the unit of residual norms."""
-        return self.dt * self.body.weight
-
-    def end_positions(self, velocities: np.ndarray) -> np.ndarray:
-        """Return x + dt v (N, 3), m."""
-        return self.state.positions + self.dt * velocities
 
     def is_inversion_free(self, velocities: np.ndarray) -> bool:
         """Return True if no element is inverted at the end positions of ``velocities`` (N, 3)."""
@@ -125,29 +86,6 @@ class StepProblem:
         """Return minus the forces of elasticity, damping and muscles at the end of the step: (N, 3) N."""
         end = self.end_positions(velocities)
         return self.body.assembly.gradient(end, self.damping, tension)
-
-    def momentum_correction(self, internal_gradient: np.ndarray) -> np.ndarray:
-        """Return the angular velocity (3,) rad/s of the rotation whose momentum implicit Euler alone would lose."""
-        return self.momentum_correction_from_torque(self.rotation_modes.T @ internal_gradient.ravel())
-
-    def momentum_correction_from_torque(self, torque: np.ndarray) -> np.ndarray:
-        """Return ``momentum_correction`` of an internal gradient with ``torque`` (3,) N m about the centre of mass."""
-        return self.dt * (self.inverse_inertia @ torque)
-
-    def residual(self, velocities: np.ndarray, tension: MuscleEnergy | None) -> np.ndarray:
-        """Return the left side minus the right side of the equation, without contact forces.
-
-        Args:
-            velocities: (N, 3) m/s, at the end of the step.
-            tension: muscle energy, or None.
-
-        Returns:
-            (N, 3) N s; not finite where an element is inverted.
-        """
-        internal = self.internal_gradient(velocities, tension)
-        correction = (self.rotation_modes @ self.momentum_correction(internal)).reshape(velocities.shape)
-        change = self.inertia_ratio * velocities - self.state.velocities - self.dt * self.body.gravity - correction
-        return self.mass * change + self.dt * internal
 
     def tangent(self, factors: LinearSolver, velocities: np.ndarray, tension: MuscleEnergy | None) -> Tangent:
         """Factor the derivative of the residual, or a positive definite approximation of it.
@@ -190,7 +128,7 @@ class StepProblem:
         """Factor S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``."""
         end = self.end_positions(velocities)
         entries = self.body.assembly.enqueue_hessian(end, self.damping, factor=self.dt**2, projected=projected)
-        factors.factor(factors.entries_from(entries), self.inertia_ratio * np.repeat(self.body.node_mass, 3))
+        factors.factor(factors.entries_from(entries), self.inertia_ratio * self.coordinate_mass)
 
 
 @dataclass(frozen=True)
@@ -226,10 +164,8 @@ class Tangent:
     @cached_property
     def momentum_projection(self) -> MomentumProjection:
         """Momentum projection for the rotation modes of the step."""
-        problem, momenta = self.problem, np.ascontiguousarray(self.problem.momenta.T)
-        return MomentumProjection.of(
-            problem.rotation_modes, momenta, problem.inertia_ratio, self.factors.solve(momenta)
-        )
+        momenta = np.ascontiguousarray(self.problem.momenta.T)
+        return self.problem.momentum_projection(momenta, self.factors.solve(momenta))
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
         """Return J^-1 ``impulses``, m/s, for impulses (3N,) or (3N, m), N s."""

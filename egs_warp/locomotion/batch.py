@@ -8,17 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
 
-from egs_warp.contact.batch_contacts import BatchContacts, padded, point_gaps, select_contacts
-from egs_warp.contact.batch_step import BatchLinearization, BatchResult, BatchSolver, StageTimer, no_timer
-from egs_warp.contact.coupled_step import CoupledSolver
-from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
+from egs_warp.contact.batch_step import BatchInputs, BatchLinearization, BatchResult, BatchSolver, StageTimer, no_timer
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.detection import ContactDetector, ContactGeometry
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batch_problem import BatchBody, BatchProblem, apply_inverse
-from egs_warp.fem.batched import BatchedRecord, nonzero
+from egs_warp.fem.batched import BatchedRecord, nonzero, padded
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.panel_cholesky import CHUNK_BYTES, PANEL
 from egs_warp.locomotion.settings import LocomotionSettings
@@ -52,24 +52,9 @@ class BatchState(BatchedRecord):
 class BatchStep(BatchedRecord):
     """Result of one step of c worlds, on the device."""
 
-    dt: float
-    """s."""
     after: BatchState
-    contacts: BatchContacts
-    forces: torch.Tensor
-    """(c, K, 3) N."""
-    end_gaps: torch.Tensor
-    """(c, K) m."""
-    min_gap: torch.Tensor
-    """(c,) m."""
-    activations: torch.Tensor
-    """(c, M) m."""
-    iterations: torch.Tensor
-    """(c,) int64, Newton iterations."""
-    converged: torch.Tensor
-    """(c,) bool."""
-    added_spin: torch.Tensor
-    """(c,) rad/s, see ``StepReport``."""
+    report: StepReport
+    """Report of all worlds in tensors with a leading world axis, without timings."""
 
     @property
     def worlds(self) -> torch.Tensor:
@@ -77,48 +62,12 @@ class BatchStep(BatchedRecord):
         return self.after.worlds
 
     def reports(self) -> list[StepReport]:
-        """Download the step; return one report for each of ``worlds``, like that of a single stepper but without
-        timings."""
-        state, contacts = self.after, self.contacts
-        host = [
-            each.cpu().numpy()
-            for each in (state.positions, state.velocities, state.time, contacts.counts, contacts.points)
+        """Download the step; return one report for each of ``worlds``, like that of a single stepper."""
+        reports, counts = self.report.download(), self.after.counts.tolist()
+        return [
+            replace(report, forces=report.forces[:count], end_gaps=report.end_gaps[:count])
+            for report, count in zip(reports, counts, strict=True)
         ]
-        positions, velocities, times, counts, points = host
-        nodes, weights, axes, gaps, faces, forces, end_gaps = (
-            each.cpu().numpy()
-            for each in (
-                *(contacts.nodes, contacts.weights, contacts.axes, contacts.gaps, contacts.faces),
-                *(self.forces, self.end_gaps),
-            )
-        )
-        min_gap, activations, iterations, converged, spins = (
-            each.cpu().numpy()
-            for each in (self.min_gap, self.activations, self.iterations, self.converged, self.added_spin)
-        )
-        reports = []
-        for world, count in enumerate(counts.tolist()):
-            valid = slice(0, count)
-            contact_set = ContactSet(
-                *(points[world, valid].astype(int), nodes[world, valid], weights[world, valid], axes[world, valid]),
-                *(gaps[world, valid], faces[world, valid], positions.shape[1]),
-            )
-            report = StepReport(
-                state=BodyState(positions[world], velocities[world], float(times[world])),
-                dt=self.dt,
-                contacts=contact_set,
-                forces=forces[world, valid],
-                end_gaps=end_gaps[world, valid],
-                min_gap=float(min_gap[world]),
-                activations=activations[world],
-                qp_count=0,
-                qp_infeasible=0,
-                newton_iterations=int(iterations[world]),
-                converged=bool(converged[world]),
-                added_spin=float(spins[world]),
-            )
-            reports.append(report)
-        return reports
 
 
 class BatchStepper:
@@ -166,7 +115,6 @@ class BatchStepper:
             self.selector,
             push_out_cap=self.settings.push_out_cap * body.speed_unit,
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
-            tolerance=CoupledSolver.tolerance,
             stages=stages,
         )
         self._stages = stages
@@ -227,17 +175,12 @@ class BatchStepper:
             The state; (c,) m, largest displacement of a node along an axis; and (c,) bool, True where a tangent was not
             positive definite.
         """
-        problem = self._problem(state, dt, 0.0)
-        contacts, previous_forces, start_gaps = self._detect(problem, state)
-        velocities = problem.rigid_guess
+        tensions = self._stiffness.new_zeros((len(state.worlds), len(self._stiffness)))
+        inputs, previous_forces = self._start(state, tensions, dt, 0.0)
+        problem, velocities = inputs.problem, inputs.problem.rigid_guess
         failed = ~problem.factor(velocities, None)
-        contacts, result = self.solver.solve(
-            *(problem, contacts, self.solver.linearize(problem, contacts)),
-            *(self._stiffness.new_zeros((len(velocities), len(self._stiffness))), self._frictions[state.worlds]),
-            velocities=velocities,
-            forces=previous_forces,
-            start_gaps=start_gaps,
-        )
+        response = self.solver.linearize(problem, inputs.contacts)
+        contacts, result = self.solver.solve(inputs, response, velocities=velocities, forces=previous_forces)
         after = BatchState(
             *(state.worlds, problem.end_positions(result.velocities), torch.zeros_like(velocities), state.time),
             *(contacts.points, contacts.counts, result.forces),
@@ -263,7 +206,7 @@ class BatchStepper:
             after, done, failed = self._parts(state, on_device, dt, MAX_HALVINGS)
             solved = torch.zeros(len(self._frictions), dtype=torch.bool, device=self.device)
             for step in done:
-                solved[step.worlds] |= step.converged
+                solved[step.worlds] |= step.report.converged
             failed |= ~solved[state.worlds]
             solved[state.worlds[failed]] = False
             solved_steps = [step.subset(nonzero(solved[step.worlds])) for step in done]
@@ -283,11 +226,12 @@ class BatchStepper:
             State of the solved worlds, their steps, and (c,) bool, True for failed worlds.
         """
         step, failed = self._step(state, activations, dt)
-        repeated = nonzero(~step.converged & ~failed)
+        converged = step.report.converged
+        repeated = nonzero(~converged & ~failed)
         if max_halvings == 0 or len(repeated) == 0:
             solved = nonzero(~failed)
             return step.after.subset(solved), [step.subset(solved)], failed
-        solved = nonzero(step.converged & ~failed)
+        solved = nonzero(converged & ~failed)
         done, after = [step.subset(solved)], step.after.subset(solved)
         half, rows, half_activations = state.gather(repeated), repeated, activations[repeated]
         for _ in range(2):
@@ -300,43 +244,33 @@ class BatchStepper:
     def _step(self, state: BatchState, activations: torch.Tensor, dt: float) -> tuple[BatchStep, torch.Tensor]:
         """Make one step of all worlds, as ``LocomotionStepper.step_with_activations`` does; also return (c,) bool, True
         where a tangent was not positive definite."""
-        frictions, tensions = self._frictions[state.worlds], self._stiffness * activations
         with self._stages("detect"):
-            problem = self._problem(state, dt, self.settings.drag)
-            contacts, previous_forces, start_gaps = self._detect(problem, state)
-        response, velocities, forces, failed = self._predict(problem, contacts, previous_forces, tensions, frictions)
-        contacts, result = self.solver.solve(
-            *(problem, contacts, response, tensions, frictions),
-            velocities=velocities,
-            forces=forces,
-            start_gaps=start_gaps,
-        )
-        step = self._finish(problem, contacts, result, state, activations)
+            inputs, previous_forces = self._start(state, self._stiffness * activations, dt, self.settings.drag)
+        response, velocities, forces, failed = self._predict(inputs, previous_forces)
+        contacts, result = self.solver.solve(inputs, response, velocities=velocities, forces=forces)
         failed |= result.is_singular
-        return replace(step, converged=step.converged & ~failed), failed
+        result = replace(result, converged=result.converged & ~failed)
+        return self._finish(inputs, contacts, result, state, activations), failed
 
-    def _problem(self, state: BatchState, dt: float, drag: float) -> BatchProblem:
-        return BatchProblem.at(self.common, state.worlds, state.positions, state.velocities, dt=dt, drag=drag)
+    def _start(
+        self, state: BatchState, tensions: torch.Tensor, dt: float, drag: float
+    ) -> tuple[BatchInputs, torch.Tensor]:
+        """Detect the contacts of a step of ``dt`` seconds under muscle ``tensions`` (c, M) N.
 
-    def _detect(
-        self, problem: BatchProblem, state: BatchState
-    ) -> tuple[BatchContacts, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-        """Return the contacts, their forces (c, K, 3) N in the previous step, and gaps and faces at the start."""
-        ballistic = state.velocities + problem.dt * self.common.gravity
-        gaps, _ = point_gaps(self.detector, problem.end_positions(ballistic))
+        Returns:
+            Inputs of the solve, and (c, K, 3) N, the forces of the contacts in the previous step.
+        """
+        problem = BatchProblem.at(self.common, state.worlds, state.positions, state.velocities, dt=dt, drag=drag)
+        gaps, _ = self.detector.gaps_of_worlds(problem.ballistic_positions)
         previous = state.points, state.counts, (state.forces[:, :, 0] > 0.0).int()
-        chosen = select_contacts(self.selector, previous, gaps)
-        start_gaps = point_gaps(self.detector, state.positions)
-        contacts = BatchContacts.at(self.detector, *chosen, state.positions, start_gaps)
-        return contacts, contacts.transferred_forces(state.points, state.counts, state.forces), start_gaps
+        start = self.detector.gaps_of_worlds(state.positions)
+        contacts = self.detector.contact_sets(*self.selector.select_in_worlds(previous, gaps), state.positions, start)
+        bias, frictions = self.solver.normal_bias(contacts, dt), self._frictions[state.worlds]
+        inputs = BatchInputs(problem, contacts, bias, tensions, frictions, *start)
+        return inputs, contacts.transferred_forces(state.points, state.forces, state.counts)
 
     def _predict(
-        self,
-        problem: BatchProblem,
-        contacts: BatchContacts,
-        previous_forces: torch.Tensor,
-        tensions: torch.Tensor,
-        frictions: torch.Tensor,
+        self, inputs: BatchInputs, previous_forces: torch.Tensor
     ) -> tuple[BatchLinearization, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Predict the end of the step in all worlds, as ``LocomotionStepper.predict`` does.
 
@@ -344,13 +278,12 @@ class BatchStepper:
             Contact linearisation, velocities (c, N, 3) m/s, forces (c, K, 3) N, and (c,) bool, True where a tangent was
             not positive definite.
         """
-        solver, stages = self.solver, self._stages
-        velocities, bias = problem.rigid_guess.clone(), solver.normal_bias(contacts, problem.dt)
+        solver, stages, problem = self.solver, self._stages, inputs.problem
+        velocities = problem.rigid_guess.clone()
         with stages("factor"):
             failed = ~problem.factor(velocities, None)
         with stages("elasticity"):
-            residual = problem.residual(velocities, tensions)
-        residual = residual - problem.dt * contacts.nodal_forces(previous_forces, velocities.shape[1])
+            residual = inputs.trial_at(velocities, previous_forces).residual
         with stages("substitute"):
             newton_step, _ = apply_inverse(problem, residual.flatten(1)[:, :, None])
         trial = velocities - newton_step.view_as(velocities)
@@ -359,59 +292,56 @@ class BatchStepper:
         if len(accepted) > 0:
             with stages("factor"):
                 failed[accepted] = ~problem.subset(accepted).factor(velocities[accepted], None)
-        response = solver.linearize(problem, contacts)
+        response = solver.linearize(problem, inputs.contacts)
         active, forces = nonzero(~failed), previous_forces.clone()
         for _ in range(PREDICTION_ITERATIONS):
             if len(active) == 0:
                 break
-            part, active_contacts, linearization = (
-                problem.subset(active),
-                contacts.subset(active),
-                response.subset(active),
-            )
+            part = inputs.subset(active)
             with stages("elasticity"):
-                residual = part.residual(velocities[active], tensions[active])
-            with stages("substitute"):
-                newton_step, _ = apply_inverse(part, residual.flatten(1)[:, :, None], linearization.momentum_projection)
-            free = velocities[active] - newton_step.view_as(residual)
-            contact_forces, _ = solver.solve_coulomb(
-                active_contacts, linearization, free, bias[active], frictions[active], previous_forces[active]
-            )
-            trial = free + (linearization.columns @ contact_forces.flatten(1)[:, :, None]).view_as(free)
-            solved = part.is_inversion_free(trial)
-            forces[active] = contact_forces
+                start = part.trial_at(velocities[active], previous_forces[active])
+            operands = start.velocities, start.free_residual, start.forces
+            step, _ = solver.newton_step(part, response.subset(active), *operands)
+            forces[active] = step.target_forces
+            ends = step.free_velocities + step.force_velocities
+            solved = part.problem.is_inversion_free(ends)
             active = active[solved]
-            velocities[active], previous_forces[active] = trial[solved], contact_forces[solved]
+            velocities[active], previous_forces[active] = ends[solved], step.target_forces[solved]
         return response, velocities, forces, failed
 
     def _finish(
         self,
-        problem: BatchProblem,
-        contacts: BatchContacts,
+        inputs: BatchInputs,
+        contacts: ContactSet,
         result: BatchResult,
         state: BatchState,
         activations: torch.Tensor,
     ) -> BatchStep:
+        problem = inputs.problem
         end = problem.end_positions(result.velocities)
         with self._stages("detect"):
-            gaps, _ = point_gaps(self.detector, end)
-        internal = problem.internal_gradient(result.velocities, self._stiffness * activations)
+            gaps, _ = self.detector.gaps_of_worlds(end)
+        internal = problem.internal_gradient(result.velocities, inputs.tensions)
         after = BatchState(
             *(state.worlds, end, result.velocities, state.time + problem.dt),
             *(contacts.points, contacts.counts, result.forces),
         )
-        return BatchStep(
-            dt=problem.dt,
-            after=after,
-            contacts=contacts,
-            forces=result.forces,
-            end_gaps=contacts.end_gaps(problem.dt, result.velocities),
-            min_gap=gaps.amin(dim=1),
-            activations=activations,
-            iterations=result.iterations,
-            converged=result.converged,
-            added_spin=problem.momentum_correction(internal).norm(dim=1),
-        )
+        values: Any = after.positions, after.velocities, after.time
+        report: Any = {
+            "state": BodyState(*values),
+            "dt": problem.dt,
+            "contacts": contacts,
+            "forces": result.forces,
+            "end_gaps": contacts.end_gaps(problem.dt, result.velocities),
+            "min_gap": gaps.amin(dim=1),
+            "activations": activations,
+            "qp_count": 0,
+            "qp_infeasible": 0,
+            "newton_iterations": result.iterations,
+            "converged": result.converged,
+            "added_spin": problem.momentum_correction(internal).norm(dim=1),
+        }
+        return BatchStep(after, StepReport(**report))
 
 
 def _merged(one: BatchState, other: BatchState) -> BatchState:

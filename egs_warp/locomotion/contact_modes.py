@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import get_lapack_funcs
 
-from egs_warp.contact.coulomb import coulomb_forces
+from egs_warp.contact.coulomb import coulomb_forces, regularized
 from egs_warp.kernels.locomotion import mode_region as kernels
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 
@@ -66,8 +66,7 @@ class CoulombProgram:
     def contact_response(self, activations: np.ndarray, guess: np.ndarray) -> np.ndarray:
         """Return x = (a, f(a)), (m + 3n,), for ``activations`` (m,). The Coulomb solve starts from ``guess`` (n, 3)."""
         m, n = self.activation_count, self.contact_count
-        operator = self.rows[:, m:].copy()
-        operator[np.diag_indices_from(operator)] += kernels.DELASSUS_REGULARIZATION * operator.diagonal().mean()
+        operator = regularized(self.rows[:, m:], kernels.DELASSUS_REGULARIZATION)
         free = self.offset + self.rows[:, :m] @ activations
         forces, _ = coulomb_forces(operator, free, np.zeros(n), self.friction, guess)
         return np.concatenate([activations, forces.ravel()])
@@ -201,7 +200,7 @@ def solve_relaxed(program: CoulombProgram, solver: QpSolver | str) -> tuple[np.n
     A = np.vstack([np.eye(m, m + 3 * n), *cone, program.rows[::3]])
     lower = np.concatenate([program.lower, np.zeros(n * (1 + kernels.CONE_FACES)), -program.offset[::3]])
     upper = np.concatenate([program.upper, np.full(len(lower) - m, np.inf)])
-    P = program.P + kernels.DELASSUS_REGULARIZATION * program.P.diagonal().mean() * np.eye(len(program.P))
+    P = regularized(program.P, kernels.DELASSUS_REGULARIZATION)
     relaxed = quadratic_program(P, program.q, A, solver=solver).solve(lower, upper)
     if not relaxed.usable:
         return None

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.device_newton import DeviceContactLinearization, DeviceContactLinearizer
 from egs_warp.contact.device_newton_workspace import NewtonWorkspace
 from egs_warp.contact.device_step import vectors

@@ -197,9 +197,9 @@ class PlanWorkspace:
         with body.stream:
             body.set_problem(problem)
             newton.set_contacts(start.contacts)
-            body.factors.upload_diagonal((1.0 + problem.dt * problem.drag) * self.owner.masses)
+            body.factors.upload_diagonal(problem.inertia_ratio * self.owner.masses)
             self._upload_inputs(start, start.activations)
-            self._run(self._enqueue_prediction, problem.dt, 1.0 + problem.dt * problem.drag)
+            self._run(self._enqueue_prediction, problem.dt, problem.inertia_ratio)
         body.factors.mark_started()
         self._start_linear_step(start, FROM_TRIAL)
         body.predicted_start = start
@@ -237,7 +237,7 @@ class PlanWorkspace:
 
     def _start_linear_step(self, start: StepInputs, base: float) -> None:
         """Start computing the linear step about the iterate in the slot ``base``, asynchronously."""
-        dt, ratio = start.problem.dt, 1.0 + start.problem.dt * start.problem.drag
+        dt, ratio = start.problem.dt, start.problem.inertia_ratio
         with self.body.stream:
             self._run(self._enqueue_linear, dt, ratio, self._horizon(dt), base)
         self.owner.factors.mark_started()
@@ -245,7 +245,7 @@ class PlanWorkspace:
     def _start_search(self, start: StepInputs, objectives: Sequence[AnyObjective]) -> None:
         """Build the QP about the linear step and search it. The solve starts on the device at once if the result is
         accepted."""
-        dt, ratio = start.problem.dt, 1.0 + start.problem.dt * start.problem.drag
+        dt, ratio = start.problem.dt, start.problem.inertia_ratio
         with self.body.stream:
             self._write_objectives(start, objectives)
             self._is_restart_parallel = start.contacts.count > 0 and self._objective >= PARALLEL_RESTART_COST
@@ -359,7 +359,7 @@ class PlanWorkspace:
         with body.stream:
             self._uploaded_point.set(x, np.zeros(len(self._x) - 1 - len(x)), np.ones(1))
             self._x.copy_(self._uploaded_point.device)
-            self._run(self._enqueue_end, problem.dt, 1.0 + problem.dt * problem.drag)
+            self._run(self._enqueue_end, problem.dt, problem.inertia_ratio)
         self._start_solve(start)
 
     def _start_solve(self, start: StepInputs, enabled: torch.Tensor | None = None) -> None:

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.newton import ContactLinearization
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.launching import run_concurrently

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import ConvexHull
 
-from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.frames import cross_matrices, orthonormal_basis

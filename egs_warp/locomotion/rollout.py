@@ -12,7 +12,7 @@ import numpy as np
 
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.step_problem import UnsolvableStepError
+from egs_warp.fem.implicit_step import UnsolvableStepError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import MIN_STEPS_PER_TIME_UNIT

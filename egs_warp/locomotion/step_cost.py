@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.fem.implicit_step import UnsolvableStepError
 from egs_warp.fem.linear_solver import FactorStatus, LinearSolver
-from egs_warp.fem.step_problem import StepProblem, UnsolvableStepError
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.linear_step import LinearStep
 from egs_warp.locomotion.objectives import AnyObjective, Objective
 
@@ -91,7 +92,7 @@ def objectives_value(
         forces: (n, 3) N, contact forces.
         speed: unit of speed sqrt(g H), m/s.
     """
-    angular_impulse = problem.dt * (problem.rotation_modes.T @ contacts.nodal_forces(forces))
+    angular_impulse = problem.dt * (problem.rotation_modes.T @ contacts.nodal_forces(forces).ravel())
     residuals = [
         objective.residual(problem, contacts, velocities.ravel(), angular_impulse, speed) for objective in objectives
     ]

@@ -15,10 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coupled_step import CoupledResult, CoupledSolver
-from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
-from egs_warp.contact.newton import ContactLinearization, ContactLinearizer, HostContactLinearizer
+from egs_warp.contact.detection import ContactDetector, ContactGeometry
+from egs_warp.contact.newton import ContactLinearization, ContactLinearizer
 from egs_warp.contact.selection import ContactSelector
+from egs_warp.fem.batched import BatchedRecord
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.multifrontal import MultifrontalLdl
@@ -71,7 +73,7 @@ class WarmStart:
 
 
 @dataclass(frozen=True)
-class StepReport:
+class StepReport(BatchedRecord):
     """Result of one step."""
 
     __repr__ = short_repr
@@ -198,7 +200,7 @@ class LocomotionStepper:
         problem = StepProblem(self.body, state, dt)
         contacts = self._detect(problem, memory)
         response = self.linearizer(problem.tangent(self.factors, problem.rigid_guess, None), contacts)
-        forces = self.selector.transfer_forces(contacts.points, memory.points, memory.forces)
+        forces = contacts.transferred_forces(memory.points, memory.forces)
         return self.solver.solve(response, None, velocities=problem.rigid_guess, forces=forces)
 
     def advance(
@@ -353,7 +355,7 @@ class LocomotionStepper:
     def step_inputs(self, problem: StepProblem, contacts: ContactSet, memory: WarmStart) -> StepInputs:
         """Collect the inputs of a step with these ``contacts``: velocity bias, and the previous activations and contact
         forces of ``memory``."""
-        previous_forces = self.selector.transfer_forces(contacts.points, memory.points, memory.forces)
+        previous_forces = contacts.transferred_forces(memory.points, memory.forces)
         bias = self.solver.normal_bias(contacts, problem.dt)
         return StepInputs(problem, contacts, bias, self.geometry.friction, memory.activations, previous_forces)
 
@@ -427,8 +429,7 @@ class LocomotionStepper:
         contacts = self.linearizer.select_contacts(problem, memory.points, loaded)
         if contacts is not None:
             return contacts
-        ballistic = problem.state.velocities + problem.dt * self.body.gravity
-        gaps, _ = self.detector.gaps(problem.end_positions(ballistic))
+        gaps, _ = self.detector.gaps(problem.ballistic_positions)
         return self.detector.contact_set(self.selector.select(memory.points, loaded, gaps), problem.state.positions)
 
     def predict(self, start: StepInputs) -> PredictedStep:
@@ -499,7 +500,7 @@ def _make_linearizer(
 ) -> ContactLinearizer:
     """Return the contact linearizer for tangents of ``body``: on the host, or on the device of ``factors``."""
     if isinstance(factors, MultifrontalLdl):
-        return HostContactLinearizer()
+        return ContactLinearizer()
     from egs_warp.contact.device_newton import DeviceContactLinearizer
     from egs_warp.contact.prefetch import ContactPrefetch
     from egs_warp.fem.tiled_cholesky import TiledCholesky
@@ -511,7 +512,7 @@ def _make_linearizer(
 
 def make_step_linearizer(linearizer: ContactLinearizer, muscles: MuscleSet, synergies: Synergies) -> StepLinearizer:
     """Return the step linearizer that matches ``linearizer``: on the host or on its device."""
-    if isinstance(linearizer, HostContactLinearizer):
+    if linearizer.is_on_host:
         return HostStepLinearizer(muscles, synergies)
     from egs_warp.contact.device_newton import DeviceContactLinearizer
     from egs_warp.locomotion.device_linear_step import DeviceLinearSteps
@@ -524,7 +525,7 @@ def _make_device_planner(planner: StepPlanner, linearizer: ContactLinearizer, so
     """Return a device planner, or None if the matrices are on the host or the strategy or the QP solver runs on the
     host."""
     settings, device = planner.settings, planner.body.assembly.device
-    if isinstance(linearizer, HostContactLinearizer) or Strategy(settings.strategy) is not Strategy.MODES:
+    if linearizer.is_on_host or Strategy(settings.strategy) is not Strategy.MODES:
         return None
     if settings.qp_solver_on(device) is not QpSolver.ADMM:
         return None

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.geometry.tetmesh import TetMesh, edge_graph, mean_edge_length
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs

@@ -56,6 +56,14 @@ def force_length_factor(shortened: Any) -> tuple[Any, Any, Any]:
     return along**2 * (3.0 - 2.0 * along), integral, 6.0 * along * (1.0 - along) / width
 
 
+def segment_stiffnesses(tensions: Any, lengths: Any, rest_lengths: Any) -> tuple[Any, Any]:
+    """Return the transverse and the axial stiffness of segments, N/m, arrays or tensors: the tension divided by the
+    length, and its derivative with respect to the length, which is 0 at full force.
+    """
+    share, _, slope = force_length_factor(lengths / rest_lengths)
+    return tensions * share / lengths, tensions * slope / rest_lengths
+
+
 def activation_jacobian(muscles: MuscleSet, positions: np.ndarray) -> sparse.csc_matrix:
     """Return A(p) of Eq. (7), (3N, M) N/m: nodal forces per metre of activation, at node ``positions`` (N, 3).
 
@@ -160,11 +168,8 @@ class MuscleEnergy:
     def hessian(self, positions: np.ndarray) -> TensionHessian:
         """Return the Hessian of V at node ``positions`` (N, 3)."""
         vectors, lengths = segment_vectors(self.rows, positions)
-        share, _, slope = force_length_factor(lengths / self.rest_lengths)
-        return TensionHessian(
-            *(self.rows, vectors / lengths[:, None], self.tensions * share / lengths),
-            self.tensions * slope / self.rest_lengths,
-        )
+        stiffnesses = segment_stiffnesses(self.tensions, lengths, self.rest_lengths)
+        return TensionHessian(self.rows, vectors / lengths[:, None], *stiffnesses)
 
 
 @dataclass(frozen=True)

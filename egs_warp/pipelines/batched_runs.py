@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from egs_warp.fem.body import BodyState
-from egs_warp.fem.step_problem import UNSOLVABLE, UnsolvableStepError
+from egs_warp.fem.implicit_step import UNSOLVABLE, UnsolvableStepError
 from egs_warp.launching import available_threads
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from egs_warp.contact.batch_contacts import BatchContacts, point_gaps
-from egs_warp.contact.batch_step import BatchResult, BatchSolver
+from egs_warp.contact.batch_step import BatchInputs, BatchResult, BatchSolver
+from egs_warp.contact.contact_set import ContactSet, push_out_speeds
 from egs_warp.contact.coupled_step import ContactLinearization, CoupledResult, CoupledSolver
-from egs_warp.contact.detection import ContactDetector, push_out_speeds
+from egs_warp.contact.detection import ContactDetector
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batch_problem import BatchBody, BatchProblem
 from egs_warp.fem.body import BodyState
@@ -72,7 +72,7 @@ def lowest_points(points: ContactSelector, gaps: np.ndarray) -> np.ndarray:
 
 def solved_together(
     creature: Creature, states: list[BodyState], activations: np.ndarray, dt: float, *, few: bool = False
-) -> tuple[BatchContacts, BatchContacts, BatchResult]:
+) -> tuple[ContactSet, ContactSet, BatchResult]:
     """Return the contacts at the start and at the end, and the result. The start contacts are the points that touch the
     ground in free motion; with ``few`` only a third of them."""
     one, count = creature.stepper.solver, len(states)
@@ -89,23 +89,22 @@ def solved_together(
     )
     common = BatchBody(creature.body, creature.muscles, count)
     problem = BatchProblem.at(common, torch.arange(count), positions, velocities, dt=dt, drag=DRAG)
-    begun = point_gaps(detector, positions)
-    ends, _ = point_gaps(detector, problem.end_positions(velocities + dt * common.gravity))
+    begun = detector.gaps_of_worlds(positions)
+    ends, _ = detector.gaps_of_worlds(problem.ballistic_positions)
     near = [lowest_points(one.points, gaps.numpy()) for gaps in ends]
     near = [each[each % 3 == 0] if few else each for each in near]
     counts = torch.tensor([len(each) for each in near], dtype=torch.int32)
     points = torch.zeros((count, int(counts.max())), dtype=torch.int32)
     for row, each in zip(points, near, strict=True):
         row[: len(each)] = torch.from_numpy(each)
-    contacts = BatchContacts.at(detector, points, counts, positions, begun)
+    contacts = detector.contact_sets(points, counts, positions, begun)
     assert problem.factor(problem.rigid_guess, None).all()
-    touched, made = beside.solve(
-        *(problem, contacts, beside.linearize(problem, contacts)),
-        *(torch.from_numpy(creature.muscles.stiffness * activations), torch.tensor(FRICTIONS, dtype=torch.float64)),
-        velocities=problem.rigid_guess,
-        forces=torch.zeros((count, contacts.capacity, 3), dtype=torch.float64),
-        start_gaps=begun,
-    )
+    tensions = torch.from_numpy(creature.muscles.stiffness * activations)
+    frictions = torch.tensor(FRICTIONS, dtype=torch.float64)
+    inputs = BatchInputs(problem, contacts, beside.normal_bias(contacts, dt), tensions, frictions, *begun)
+    forces = torch.zeros((count, contacts.capacity, 3), dtype=torch.float64)
+    response = beside.linearize(problem, contacts)
+    touched, made = beside.solve(inputs, response, velocities=problem.rigid_guess, forces=forces)
     assert torch.equal(contacts.counts, counts)
     return contacts, touched, made
 
@@ -184,9 +183,9 @@ def test_normal_bias_equals_that_of_one_world(creature: Creature, states: list[B
     detector = ContactDetector(creature.geometry, device="cpu")
     beside = BatchSolver(detector, one.points, push_out_cap=0.05, penetration_tolerance=0.01, tolerance=1e-8)
     nodes = torch.from_numpy(np.stack([states[0].positions, states[0].positions - np.array([0.0, 0.0, 0.03])]))
-    gaps, faces = point_gaps(detector, nodes)
+    gaps, faces = detector.gaps_of_worlds(nodes)
     order = torch.argsort((gaps >= 0.003).int(), dim=1, stable=True).int()
-    contacts = BatchContacts.at(detector, order, (gaps < 0.003).sum(dim=1).int(), nodes, (gaps, faces))
+    contacts = detector.contact_sets(order, (gaps < 0.003).sum(dim=1).int(), nodes, (gaps, faces))
     made = beside.normal_bias(contacts, dt).numpy()
     counts = contacts.counts.tolist()
     assert counts[0] < counts[1]

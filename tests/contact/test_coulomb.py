@@ -12,12 +12,12 @@ import torch
 import warp as wp
 
 from egs_warp.contact import coulomb, newton
-from egs_warp.contact.coulomb import coulomb_forces, pack_contacts
-from egs_warp.contact.device_coulomb import coulomb_forces_batch
-from egs_warp.kernels.contact.coulomb import sweeps_kernel
+from egs_warp.contact.coulomb import coulomb_forces, coulomb_forces_of_worlds
+from egs_warp.kernels.contact.coulomb_equations import Contacts
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn, sagging
+from tests.support.kernels import sweeps_kernel
 
 COUNT = 5
 
@@ -57,7 +57,10 @@ def test_sweeps_equal_their_twin(friction: float, sweeps: int) -> None:
     for seed in range(60):
         delassus, free, shift, start = problem(seed)
         forces = wp.array(start.ravel(), dtype=wp.float64, device="cpu")
-        given = pack_contacts(delassus, free, shift, friction)
+        given = Contacts()
+        given.count, given.friction = len(shift), friction
+        arrays = (wp.array(each, dtype=wp.float64, device="cpu") for each in (delassus, free, shift))
+        given.delassus, given.free_velocity, given.normal_bias = arrays
         wp.launch(sweeps_kernel, dim=1, inputs=[given, sweeps, forces], device="cpu")
         got = forces.numpy().reshape(-1, 3)
         expected = swept_twin(delassus, free, shift, friction, start, sweeps)
@@ -107,7 +110,7 @@ def test_batched_problems_have_the_bits_of_single_ones() -> None:
         shifts[world, :count], starts[world, :count] = part[2:]
         alone.append(coulomb_forces(*part[:3], frictions[world], part[3]))
     together = (torch.from_numpy(each) for each in (delassus, free, shifts, frictions, starts))
-    forces, missed = coulomb_forces_batch(torch.tensor(counts, dtype=torch.int32), *together)
+    forces, missed = coulomb_forces_of_worlds(torch.tensor(counts, dtype=torch.int32), *together)
     for world, count in enumerate(counts):
         assert np.array_equal(forces[world, :count].numpy(), alone[world][0])
         assert float(missed[world]) == alone[world][1]
@@ -126,7 +129,7 @@ def test_batched_problems_at_the_iteration_limit_have_the_bits_of_single_ones() 
         problems.append((half @ half.T + 1e-7 * np.eye(3 * count), free, shift, start))
     delassus, free, shifts, starts = (torch.from_numpy(np.stack(each)) for each in zip(*problems, strict=True))
     counts, frictions = torch.full((40,), count, dtype=torch.int32), torch.full((40,), friction, dtype=torch.float64)
-    forces, missed = coulomb_forces_batch(counts, delassus, free, shifts, frictions, starts)
+    forces, missed = coulomb_forces_of_worlds(counts, delassus, free, shifts, frictions, starts)
     alone = [coulomb_forces(matrix, u, shift, friction, start) for matrix, u, shift, start in problems]
     assert np.array_equal(forces.numpy(), np.stack([one for one, _ in alone]))
     assert missed.tolist() == [size for _, size in alone] and 5 < (missed > 1e-9).sum() < 35
@@ -146,8 +149,8 @@ def test_a_thread_block_finds_the_forces_of_a_single_thread(friction: float) -> 
     frictions = np.full(len(counts), friction)
     given = [torch.from_numpy(each) for each in (delassus, free, shifts, frictions, starts)]
     numbers = torch.tensor(counts, dtype=torch.int32)
-    one, _ = coulomb_forces_batch(numbers, *given)
-    block, missed = coulomb_forces_batch(numbers.cuda(), *(each.cuda() for each in given))
+    one, _ = coulomb_forces_of_worlds(numbers, *given)
+    block, missed = coulomb_forces_of_worlds(numbers.cuda(), *(each.cuda() for each in given))
     assert float(missed.max()) < 1e-9
     np.testing.assert_allclose(block.cpu().numpy(), one.numpy(), rtol=0, atol=1e-9 * float(one.abs().max()))
 
@@ -168,8 +171,8 @@ def test_a_thread_block_finds_the_forces_of_many_loaded_contacts(friction: float
     frictions = np.full(len(counts), friction)
     given = [torch.from_numpy(each) for each in (delassus, free, shifts, frictions, starts)]
     numbers = torch.tensor(counts, dtype=torch.int32)
-    one, _ = coulomb_forces_batch(numbers, *given)
-    block, missed = coulomb_forces_batch(numbers.cuda(), *(each.cuda() for each in given))
+    one, _ = coulomb_forces_of_worlds(numbers, *given)
+    block, missed = coulomb_forces_of_worlds(numbers.cuda(), *(each.cuda() for each in given))
     assert float(missed.max()) < 1e-12
     for world, count in enumerate(counts):
         expected, got = one[world, :count].numpy(), block[world, :count].cpu().numpy()
@@ -228,7 +231,7 @@ def test_more_points_than_nodes_are_solved_by_continuation(monkeypatch: pytest.M
     together = [coulomb_forces(*given) for given in problems]
     assert max(alone) > 1e-5 and max(missed for _, missed in together) < 1e-12
     delassus, free, shift, friction, start = (np.stack(each) for each in zip(*problems, strict=True))
-    many, missed = coulomb_forces_batch(
+    many, missed = coulomb_forces_of_worlds(
         torch.full((len(start),), start.shape[1], dtype=torch.int32),
         *(torch.from_numpy(each) for each in (delassus, free, shift, friction, start)),
     )

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from egs_warp.contact.contact_set import push_out_speeds
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.detection import (
     ContactDetector,
     _hull_points,
     contact_geometry,
-    push_out_speeds,
     tangent_directions,
 )
 from egs_warp.contact.terrain import Solid, step
@@ -188,15 +188,15 @@ def test_contact_frame_maps_nodes_to_points(device: str) -> None:
     chosen = np.array([3, 17, 5, 40])
     contacts = detector.contact_set(chosen, mesh.nodes)
     v = np.random.default_rng(3).standard_normal(mesh.nodes.shape)
-    local = (contacts.dense_jacobian @ v.ravel()).reshape(-1, 3)
+    local = (contacts.jacobian @ v.ravel()).reshape(-1, 3)
     for i, point in enumerate(chosen):
         velocity = geometry.weights[point] @ v[mesh.tets[geometry.tet_from_point[point]]]
         assert np.allclose(contacts.axes[i] @ contacts.axes[i].T, np.eye(3), atol=1e-14)
         assert np.allclose(local[i], contacts.axes[i] @ velocity, atol=1e-13)
     many = np.random.default_rng(4).standard_normal((v.size, 5))
-    assert np.allclose(contacts.contact_velocities(many), contacts.dense_jacobian @ many, atol=1e-13)
+    assert np.allclose(contacts.contact_velocities(many), contacts.jacobian @ many, atol=1e-13)
     forces = many.ravel()[: 3 * contacts.count].reshape(-1, 3)
-    assert np.allclose(contacts.nodal_forces(forces), contacts.dense_jacobian.T @ forces.ravel(), atol=1e-13)
+    assert np.allclose(contacts.nodal_forces(forces).ravel(), contacts.jacobian.T @ forces.ravel(), atol=1e-13)
     assert np.allclose(contacts.contact_velocities(v.ravel()), local.ravel(), atol=1e-13)
     assert detector.contact_set(chosen[:0], mesh.nodes).contact_velocities(many).shape == (0, 5)
     moved, _ = detector.gaps(mesh.nodes + 0.01 * v)

@@ -11,7 +11,8 @@ pytest.importorskip("torch")
 import torch
 import warp as wp
 
-from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.detection import ContactDetector, ContactGeometry
 from egs_warp.contact.prefetch import ContactPrefetch
 from egs_warp.contact.selection import ACTIVATION_DEPTH, MAX_CREEP, MAX_SINK, ContactSelector
 from egs_warp.deformation.embedding import embed_points

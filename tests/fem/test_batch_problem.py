@@ -84,7 +84,7 @@ def test_initial_values_of_a_step(body: SoftBody, beside: BatchProblem, alone: l
     same(beside.rigid_guess[:2], [one.rigid_guess for one in alone[:2]])
     assert np.abs(beside.rigid_guess[2].numpy()).max() < 1e-12
     centres = [body.centre_of_mass(one.state.positions) for one in alone]
-    same(beside.body.centre(beside.positions), centres)
+    same(beside.worlds.centre(beside.state.positions), centres)
 
 
 @pytest.mark.parametrize("pulling", [False, True])

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 
-from egs_warp.fem.batched import BatchedRecord, nonzero, repeat_offsets
-
-CPU = torch.device("cpu")
+from egs_warp.fem.batched import BatchedRecord, nonzero, padded
 
 
 @dataclass(frozen=True)
@@ -45,14 +42,6 @@ def test_worlds_are_written_back_in_place() -> None:
     assert record.places.tolist() == [[-1.0, -1.0], [20.0, 30.0], [-1.0, -1.0], [60.0, 70.0]]
 
 
-def test_copies_of_an_index_map_are_concatenated() -> None:
-    """Negative entries are unchanged."""
-    assert repeat_offsets(np.array([[0, 2], [-1, 1]]), 3, 5, CPU).tolist() == [
-        [0, 2],
-        [-1, 1],
-        [5, 7],
-        [-1, 6],
-        [10, 12],
-        [-1, 11],
-    ]
+def test_indices_of_a_mask_and_padding() -> None:
     assert nonzero(torch.tensor([False, True, True])).tolist() == [1, 2]
+    assert padded(torch.tensor([[1, 2]]), 1).tolist() == [[1, 2, 0]]

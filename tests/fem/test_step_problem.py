@@ -57,13 +57,13 @@ def test_the_residual_is_the_derivative_of_an_energy_up_to_a_rotation(device: st
     def phi(velocities: np.ndarray) -> float:
         end = problem.end_positions(velocities)
         change = velocities - problem.state.velocities
-        kinetic = 0.5 * float((problem.mass * (change**2 + DT * 0.7 * velocities**2)).sum())
+        kinetic = 0.5 * float((problem.node_mass[:, None] * (change**2 + DT * 0.7 * velocities**2)).sum())
         pull = 0.0 if tension is None else tension.tensions @ np.linalg.norm(tension.rows @ end, axis=1)
-        weight = DT * float((problem.mass * velocities @ body.gravity[:, None]).sum())
+        weight = DT * float((problem.node_mass[:, None] * velocities @ body.gravity[:, None]).sum())
         return kinetic + body.assembly.energy(end, problem.damping) + pull - weight
 
     spin = problem.momentum_correction(problem.internal_gradient(v, tension))
-    turned = problem.mass * (problem.rotation_modes @ spin).reshape(v.shape)
+    turned = problem.node_mass[:, None] * (problem.rotation_modes @ spin).reshape(v.shape)
     assert np.linalg.norm(spin) > 1e-3
     gradient = problem.residual(v, tension) + turned
     for _ in range(4):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from egs_warp.fem.body import BodyState
-from egs_warp.fem.step_problem import UnsolvableStepError
+from egs_warp.fem.implicit_step import UnsolvableStepError
 from egs_warp.locomotion.rollout import REST_FRAMES, RolloutResult, roll_out
 from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart

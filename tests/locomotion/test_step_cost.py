@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.detection import ContactDetector, ContactGeometry
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, make_body
 from egs_warp.fem.multifrontal import MultifrontalLdl

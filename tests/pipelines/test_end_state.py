@@ -12,7 +12,7 @@ import pytest
 
 from egs_warp import cli
 from egs_warp.assets import pawn
-from egs_warp.fem.step_problem import UnsolvableStepError
+from egs_warp.fem.implicit_step import UnsolvableStepError
 from egs_warp.io import write_ply
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.trajectory import MotionOutcome

@@ -40,11 +40,11 @@ class PassiveBody:
         """Advance one step of ``dt`` s."""
         body, state, solver = self.body, self.state, self.solver
         problem = StepProblem(body, state, dt, drag)
-        gaps, _ = solver.detector.gaps(problem.end_positions(state.velocities + dt * body.gravity))
+        gaps, _ = solver.detector.gaps(problem.ballistic_positions)
         chosen = solver.points.select(self.points, self.forces[:, 0] > 0.0, gaps)
         contacts = solver.detector.contact_set(chosen, state.positions)
         tangent = problem.tangent(self.factors, problem.rigid_guess, tension)
-        start = solver.points.transfer_forces(chosen, self.points, self.forces)
+        start = contacts.transferred_forces(self.points, self.forces)
         response = ContactLinearization.of(tangent, contacts)
         result = solver.solve(response, tension, velocities=problem.rigid_guess, forces=start)
         self.state = BodyState(problem.end_positions(result.velocities), result.velocities, state.time + dt)

@@ -30,7 +30,7 @@ class ReferenceIterate:
     def residual(self) -> np.ndarray:
         """(3N,) N s, residual with contact forces."""
         response = self.linearization
-        pushes = response.contacts.nodal_forces(self.forces)
+        pushes = response.contacts.nodal_forces(self.forces).ravel()
         return self.free_residual.ravel() - response.tangent.problem.dt * pushes
 
     @property

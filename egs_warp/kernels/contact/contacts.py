@@ -100,16 +100,40 @@ def contact_velocities_kernel(
     """Compute the contact velocities W v (c, 3K, m) for nodal velocities v (c, 3N, m). The velocities of padding are
     set to zero."""
     world, k, column = wp.tid()
-    at_point = Vec3()
+    speeds = Vec3()
     if k < counts[world]:
+        corners = nodes[world, k]
+        shares = weights[world, k]
+        frame = axes[world, k]
         for corner in range(4):
-            n = 3 * nodes[world, k][corner]
-            weight = weights[world, k][corner]
             for i in range(3):
-                at_point[i] += weight * velocities[world, n + i, column]
-    speeds = axes[world, k] * at_point
+                velocity = velocities[world, 3 * corners[corner] + i, column]
+                for axis in range(3):
+                    speeds[axis] += (shares[corner] * frame[axis, i]) * velocity
     for axis in range(3):
         speeds_out[world, 3 * k + axis, column] = speeds[axis]
+
+
+@wp.func
+def nodal_force(
+    counts: wp.array[int],
+    nodes: wp.array2d[wp.vec4i],
+    weights: wp.array2d[Vec4],
+    axes: wp.array2d[Mat33],
+    forces: wp.array2d[Vec3],
+    world: int,
+    node: int,
+):
+    """Return the sum of the contact ``forces`` at a node, W^T f, over the contacts in their order."""
+    total = Vec3()
+    for k in range(counts[world]):
+        for corner in range(4):
+            if nodes[world, k][corner] == node:
+                for axis in range(3):
+                    for i in range(3):
+                        entry = weights[world, k][corner] * axes[world, k][axis, i]
+                        total[i] += entry * forces[world, k][axis]
+    return total
 
 
 @wp.kernel
@@ -123,11 +147,6 @@ def nodal_forces_kernel(
     # Out:
     pushes_out: wp.array2d[Vec3],
 ):
-    """Compute the nodal forces W^T f (c, N) in newtons. Each node sums over the contacts in their order."""
+    """Compute the nodal forces W^T f (c, N) in newtons."""
     world, node = wp.tid()
-    total = Vec3()
-    for k in range(counts[world]):
-        for corner in range(4):
-            if nodes[world, k][corner] == node:
-                total += weights[world, k][corner] * (wp.transpose(axes[world, k]) * forces[world, k])
-    pushes_out[world, node] = total
+    pushes_out[world, node] = nodal_force(counts, nodes, weights, axes, forces, world, node)

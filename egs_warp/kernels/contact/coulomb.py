@@ -414,14 +414,3 @@ def coulomb_kernel(
     newton.pivots = indices[problem, 1]
     newton.matrix = matrices[problem]
     residuals_out[problem] = find_forces(contacts, tolerance, iterations, forces[problem], newton)
-
-
-@wp.kernel
-def sweeps_kernel(
-    contacts: Contacts,
-    sweeps: int,
-    # In and out:
-    forces: wp.array[real],
-):
-    """Perform the sweeps alone, in one thread."""
-    sweep(contacts, sweeps, forces)

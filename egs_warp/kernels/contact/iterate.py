@@ -1,11 +1,13 @@
-"""Kernels that evaluate a trial of Newton's method on a step with contact on a GPU, one thread for each node or
-contact (Eq. 4, 8).
+"""Kernels that evaluate a trial of Newton's method on steps with contact, one thread for each node or contact of each
+world (Eq. 4, 8).
 
-The host code is ``egs_warp/contact/device_newton_workspace.py``; ``iterate_cpu`` is the version on a CPU.
+The host code is ``egs_warp/contact/trial.py``, and ``device_newton_workspace.py`` for the first and the last kernel;
+``iterate_cpu`` is the version on a CPU.
 """
 
 import warp as wp
 
+from egs_warp.kernels.contact.contacts import nodal_force
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -31,47 +33,49 @@ def select_base_kernel(
 @wp.kernel
 def trial_kernel(
     # Model:
-    starts: wp.array[Vec3],
+    starts: wp.array2d[Vec3],
     dt: real,
     # In:
     lengths: wp.array[real],
-    velocities: wp.array[Vec3],
-    free_velocities: wp.array[Vec3],
-    force_velocities: wp.array[Vec3],
+    velocities: wp.array2d[Vec3],
+    free_velocities: wp.array2d[Vec3],
+    force_velocities: wp.array2d[Vec3],
     # Out:
-    velocities_out: wp.array[Vec3],
-    ends_out: wp.array[Vec3],
+    velocities_out: wp.array2d[Vec3],
+    ends_out: wp.array2d[Vec3],
 ):
-    """Move the velocities along a Newton step by the fraction ``lengths[0]``, and compute the end positions of the
-    nodes.
+    """Move the velocities of each world along a Newton step by the fraction in ``lengths``, and compute the end
+    positions of the nodes.
 
     The full step ends at ``free_velocities`` (without contact forces) plus ``force_velocities`` (their effect). At
     length 0 they need not be finite.
     """
-    node = wp.tid()
-    velocity = velocities[node]
-    if lengths[0] != real(0.0):
-        end = free_velocities[node] + force_velocities[node]
-        velocity = velocities[node] + lengths[0] * (end - velocities[node])
-    velocities_out[node] = velocity
-    ends_out[node] = starts[node] + dt * velocity
+    world, node = wp.tid()
+    length = lengths[world]
+    velocity = velocities[world, node]
+    if length != real(0.0):
+        end = free_velocities[world, node] + force_velocities[world, node]
+        velocity += length * (end - velocity)
+    velocities_out[world, node] = velocity
+    ends_out[world, node] = starts[world, node] + dt * velocity
 
 
 @wp.kernel
 def trial_forces_kernel(
     # In:
     lengths: wp.array[real],
-    forces: wp.array[Vec3],
-    target_forces: wp.array[Vec3],
+    forces: wp.array2d[Vec3],
+    target_forces: wp.array2d[Vec3],
     # Out:
-    forces_out: wp.array[Vec3],
+    forces_out: wp.array2d[Vec3],
 ):
-    """Move the contact ``forces`` towards ``target_forces`` by the fraction ``lengths[0]``."""
-    contact = wp.tid()
-    force = forces[contact]
-    if lengths[0] != real(0.0):
-        force = forces[contact] + lengths[0] * (target_forces[contact] - forces[contact])
-    forces_out[contact] = force
+    """Move the contact ``forces`` of each world towards ``target_forces`` by the fraction in ``lengths``."""
+    world, contact = wp.tid()
+    length = lengths[world]
+    force = forces[world, contact]
+    if length != real(0.0):
+        force += length * (target_forces[world, contact] - force)
+    forces_out[world, contact] = force
 
 
 @wp.kernel
@@ -81,38 +85,32 @@ def residual_kernel(
     gravity: Vec3,
     ratio: real,
     dt: real,
-    arms: wp.array[Vec3],
-    turning_rates: wp.array[Mat33],
-    old_velocities: wp.array[Vec3],
-    nodes: wp.array[wp.vec4i],
-    weights: wp.array[Vec4],
-    axes: wp.array[Mat33],
+    arms: wp.array2d[Vec3],
+    inverse_inertia: wp.array[Mat33],
+    old_velocities: wp.array2d[Vec3],
+    counts: wp.array[int],
+    nodes: wp.array2d[wp.vec4i],
+    weights: wp.array2d[Vec4],
+    axes: wp.array2d[Mat33],
     # In:
     torque: wp.array[Vec3],
-    internal: wp.array[Vec3],
-    velocities: wp.array[Vec3],
-    forces: wp.array[Vec3],
+    internal: wp.array2d[Vec3],
+    velocities: wp.array2d[Vec3],
+    forces: wp.array2d[Vec3],
     # Out:
-    free_out: wp.array[Vec3],
-    rest_out: wp.array[Vec3],
+    free_out: wp.array2d[Vec3],
+    rest_out: wp.array2d[Vec3],
 ):
-    """Compute ``StepProblem.residual`` in N s, without contact forces and with them.
+    """Compute ``StepProblem.residual`` of all worlds in N s, without contact forces and with them.
 
-    ``internal`` is the internal gradient, in newtons (minus the forces), and ``torque`` its torque in N m. Padded
-    contacts have zero weight.
+    ``internal`` is the internal gradient, in newtons (minus the forces), and ``torque`` its torque in N m.
     """
-    node = wp.tid()
-    spin = dt * (turning_rates[0] * torque[0])
-    change = ratio * velocities[node] - old_velocities[node] - dt * gravity - wp.cross(spin, arms[node])
-    free = masses[node] * change + dt * internal[node]
-    contact_force = Vec3(real(0.0))
-    for contact in range(nodes.shape[0]):
-        corners = nodes[contact]
-        for corner in range(4):
-            if corners[corner] == node:
-                contact_force += weights[contact][corner] * (wp.transpose(axes[contact]) * forces[contact])
-    free_out[node] = free
-    rest_out[node] = free - dt * contact_force
+    world, node = wp.tid()
+    spin = dt * (inverse_inertia[world] * torque[world])
+    change = ratio * velocities[world, node] - old_velocities[world, node] - dt * gravity
+    free = masses[node] * (change - wp.cross(spin, arms[world, node])) + dt * internal[world, node]
+    free_out[world, node] = free
+    rest_out[world, node] = free - dt * nodal_force(counts, nodes, weights, axes, forces, world, node)
 
 
 @wp.kernel

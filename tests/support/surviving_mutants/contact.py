@@ -48,7 +48,7 @@ CONTACT = [
         "the bound only avoids a division by zero, but no tetrahedron has all its points at their mean",
     ),
     Survivor(
-        "contact/device_coulomb.py",
+        "contact/coulomb.py",
         "matrices = start.new_empty((worlds, size, (size + 4) // 4, 4))",
         "matrices = start.new_empty((worlds, size, (size + 4) // 3, 4))",
         "capacity for a few more numbers",

@@ -1,4 +1,4 @@
-"""Contacts of many worlds equal those of one: selection, frames, and nodal forces."""
+"""Products with the contact Jacobian; contacts of many worlds equal those of one."""
 
 from __future__ import annotations
 
@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from egs_warp.contact.batch_contacts import (
-    BatchContacts,
-    append_points,
-    penetrating_points,
-    point_gaps,
-    select_contacts,
-)
-from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.detection import ContactDetector, ContactGeometry
 from egs_warp.contact.selection import ACTIVATION_DEPTH, ContactSelector
 from tests.support.creatures import coarse_pawn
 from tests.support.waves import wavy_ground
@@ -49,16 +43,16 @@ def positions() -> np.ndarray:
     return np.stack([nodes, lean, deep, nodes + np.array([0.0, 0.0, 1.0])])
 
 
-def points_of(contacts: BatchContacts, world: int) -> np.ndarray:
+def points_of(contacts: ContactSet, world: int) -> np.ndarray:
     return contacts.points[world, : int(contacts.counts[world])].numpy()
 
 
-def contacts_within(detector: ContactDetector, positions: np.ndarray, distance: float) -> BatchContacts:
+def contacts_within(detector: ContactDetector, positions: np.ndarray, distance: float) -> ContactSet:
     """The contacts of all points closer than ``distance`` to the ground."""
     places = torch.from_numpy(positions)
-    gaps, faces = point_gaps(detector, places)
+    gaps, faces = detector.gaps_of_worlds(places)
     order = torch.argsort((gaps >= distance).int(), dim=1, stable=True).int()
-    return BatchContacts.at(detector, order, (gaps < distance).sum(dim=1).int(), places, (gaps, faces))
+    return detector.contact_sets(order, (gaps < distance).sum(dim=1).int(), places, (gaps, faces))
 
 
 def test_selection_equals_that_of_one_world_in_every_step(
@@ -70,24 +64,24 @@ def test_selection_equals_that_of_one_world_in_every_step(
     loads, joins = [np.zeros(0)] * WORLDS, 0
     for lifted in (0.0, 0.012, 0.025):
         places = positions + np.array([0.0, 0.0, lifted])
-        start = point_gaps(detector, torch.from_numpy(places))
+        start = detector.gaps_of_worlds(torch.from_numpy(places))
         gaps, _ = start
         most = max(map(len, before))
         previous, loaded = torch.zeros((WORLDS, most), dtype=torch.int32), torch.zeros((WORLDS, most), dtype=torch.bool)
         counts = torch.tensor([len(each) for each in before], dtype=torch.int32)
         for world, (its, load) in enumerate(zip(before, loads, strict=True)):
             previous[world, : len(its)], loaded[world, : len(its)] = torch.from_numpy(its), torch.from_numpy(load > 0.0)
-        chosen = select_contacts(points, (previous, counts, loaded.int()), gaps)
-        contacts = BatchContacts.at(detector, *chosen, torch.from_numpy(places), start)
+        chosen = points.select_in_worlds((previous, counts, loaded.int()), gaps)
+        contacts = detector.contact_sets(*chosen, torch.from_numpy(places), start)
         for world, place in enumerate(places):
             expected = points.select(before[world], loads[world] > 0.0, detector.gaps(place)[0])
             assert np.array_equal(points_of(contacts, world), expected)
         # Without noise, all points of a cell would be equally deep.
         noisy = gaps + 0.01 * torch.from_numpy(random.normal(size=gaps.shape))
         tolerance = 0.005 / ACTIVATION_DEPTH
-        lowest = penetrating_points(points, contacts, (noisy, gaps), tolerance)
-        more = append_points(points, contacts, lowest, noisy)
-        joined = BatchContacts.at(detector, *more, torch.from_numpy(places), start)
+        lowest = points.find_penetrating_in_worlds(contacts, (noisy, gaps), tolerance)
+        more = points.append_in_worlds(contacts, lowest, noisy)
+        joined = detector.contact_sets(*more, torch.from_numpy(places), start)
         for world in range(WORLDS):
             its = points_of(contacts, world)
             new = points.find_penetrating(its, noisy[world].numpy(), gaps[world].numpy(), tolerance)
@@ -106,21 +100,20 @@ def test_frames_speeds_and_pushes_are_those_of_one(detector: ContactDetector, po
     velocities = random.normal(size=(WORLDS, 3 * nodes, 2))
     forces = random.normal(size=(WORLDS, contacts.capacity, 3))
     rows, speeds = (
-        contacts.jacobian_transposed(nodes).numpy(),
+        contacts.jacobian_transposed().numpy(),
         contacts.contact_velocities(torch.from_numpy(velocities)).numpy(),
     )
-    pushes = contacts.nodal_forces(torch.from_numpy(forces), nodes).numpy()
+    pushes = contacts.nodal_forces(torch.from_numpy(forces)).numpy()
     ends = contacts.end_gaps(0.1, torch.from_numpy(velocities[:, :, 0].reshape(WORLDS, nodes, 3))).numpy()
     for world, one in enumerate(sets):
         count = one.count
         assert (
-            np.array_equal(rows[world, :, : 3 * count], one.dense_jacobian.T) and not rows[world, :, 3 * count :].any()
+            np.array_equal(rows[world, :, : 3 * count], one.jacobian.toarray().T)
+            and not rows[world, :, 3 * count :].any()
         )
-        np.testing.assert_allclose(
-            speeds[world, : 3 * count], one.dense_jacobian @ velocities[world], rtol=0, atol=1e-13
-        )
+        np.testing.assert_allclose(speeds[world, : 3 * count], one.jacobian @ velocities[world], rtol=0, atol=1e-13)
         assert not speeds[world, 3 * count :].any()
-        expected = one.dense_jacobian.T @ forces[world, :count].ravel()
+        expected = one.jacobian.T @ forces[world, :count].ravel()
         np.testing.assert_allclose(pushes[world].ravel(), expected, rtol=0, atol=1e-12)
         lone = one.end_gaps(0.1, velocities[world, :, 0].reshape(nodes, 3))
         np.testing.assert_allclose(ends[world, :count], lone, rtol=0, atol=1e-13)
@@ -135,14 +128,19 @@ def test_padding_of_contacts_is_zero(detector: ContactDetector, positions: np.nd
         assert not values[~wide.valid].any()
 
 
+def test_forces_follow_their_points_in_one_world(detector: ContactDetector, positions: np.ndarray) -> None:
+    before, forces = np.array([7, 3, 11]), np.arange(9.0).reshape(3, 3)
+    matched = detector.contact_set(np.array([3, 5, 7]), positions[0]).transferred_forces(before, forces)
+    assert np.array_equal(matched, [[3, 4, 5], [0, 0, 0], [0, 1, 2]])
+
+
 def test_forces_follow_their_points(detector: ContactDetector, positions: np.ndarray) -> None:
     now = contacts_within(detector, positions, 0.003)
     then = contacts_within(detector, positions, 0.004)
     forces = torch.from_numpy(np.random.default_rng(3).normal(size=(WORLDS, then.capacity, 3)))
-    matched = now.transferred_forces(then.points, then.counts, forces).numpy()
+    matched = now.transferred_forces(then.points, forces, then.counts).numpy()
     for world in range(WORLDS):
         count, last = int(now.counts[world]), int(then.counts[world])
-        expected = ContactSelector.transfer_forces(
-            points_of(now, world), points_of(then, world), forces[world, :last].numpy()
-        )
+        alone = now.download()[world]
+        expected = alone.transferred_forces(points_of(then, world), forces[world, :last].numpy())
         assert np.array_equal(matched[world, :count], expected) and not matched[world, count:].any()

@@ -1,0 +1,61 @@
+"""One round of Newton's method on velocities and contact forces with fixed contacts, in one world or in many (Eq. 4, 8,
+9).
+
+``run_round`` is the iteration. A world takes a full Newton step, whose contact forces satisfy Coulomb's law at the
+velocities without them, and halves it until the rule of ``newton_convergence`` accepts it. Then it may have ended or
+failed, points outside the contact set may penetrate too far, which ends the round so that they can be added, or the
+tangent may have to be renewed. ``NewtonWorlds`` is what the iteration needs: ``coupled_step`` implements it for one
+world on the host or on a GPU, ``batch_step`` for many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sized
+from typing import Any, Protocol
+
+from egs_warp.kernels.contact.newton_convergence import ENDED, FAILED, NEAR_END, NEEDS_TANGENT, SHORTEN
+
+
+class NewtonWorlds(Protocol):
+    """Worlds that run one round together. Arguments named ``worlds`` are results of ``running`` or ``active``."""
+
+    def running(self) -> Sized:
+        """Return the active worlds that have steps left."""
+        ...
+
+    def active(self, bits: int) -> Sized:
+        """Return the active worlds whose last trial had any of ``bits`` as its outcome."""
+        ...
+
+    def take_step(self, worlds: Any) -> None:
+        """Judge the trial at the end of a Newton step in each of the ``worlds``, and accept it if it is good."""
+        ...
+
+    def halve_step(self, worlds: Any) -> None:
+        """Judge the trial at the reduced length of the last step in each of the ``worlds``."""
+        ...
+
+    def stop(self, bits: int) -> None:
+        """End the round of the worlds whose last trial had any of ``bits`` as its outcome."""
+        ...
+
+    def check_penetration(self, worlds: Any) -> None:
+        """End the round of those of the ``worlds`` in which points must be added to the contacts."""
+        ...
+
+    def renew_tangent(self, worlds: Any) -> None:
+        """Factor and linearise the ``worlds`` at their velocities, and end the round of those without factors."""
+        ...
+
+
+def run_round(newton: NewtonWorlds) -> None:
+    """Iterate until the round of every world has ended."""
+    while len(worlds := newton.running()) > 0:
+        newton.take_step(worlds)
+        while len(short := newton.active(SHORTEN)) > 0:
+            newton.halve_step(short)
+        newton.stop(ENDED | FAILED)
+        if len(near := newton.active(NEAR_END)) > 0:
+            newton.check_penetration(near)
+        if len(fresh := newton.active(NEEDS_TANGENT)) > 0:
+            newton.renew_tangent(fresh)

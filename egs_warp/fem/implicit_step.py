@@ -1,0 +1,127 @@
+"""The equation of one implicit Euler step, in one world or in many (Eq. 4, 6).
+
+A step is an equation for the end velocities v: M (v - v0) + dt alpha M v = dt (P^T f(x + dt v) + M g + f_contact), with
+the forces f of elasticity, damping and muscles. ``ImplicitStep`` holds its formulas. ``step_problem.StepProblem`` is
+the step of one world in NumPy arrays (N, 3), ``batch_problem.BatchProblem`` those of c worlds in PyTorch tensors (c, N,
+3). In the shapes below, "..." is the axis of worlds, or nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from egs_warp.fem.batched import BatchedRecord, array_module
+from egs_warp.fem.body import SoftBody
+from egs_warp.fem.momentum_projection import MomentumProjection
+
+UNSOLVABLE = "the tangent is singular or not finite"
+MIN_RELATIVE_STIFFNESS = 1e-3
+"""Fraction of the largest T / L of the muscles below which a stiffness is left out of the tangent."""
+
+
+class UnsolvableStepError(ArithmeticError):
+    """The equations of a step cannot be solved."""
+
+
+class StepValues(Protocol):
+    """Values that ``ImplicitStep`` takes from its subclasses."""
+
+    node_mass: Any
+    """(N,) kg, lumped masses."""
+    gravity: Any
+    """(3,) m/s^2."""
+    rotation_modes: Any
+    """(..., 3N, 3) m, nodal velocities e_k x r of unit rotations about the centre of mass, with lever arms r."""
+    inverse_inertia: Any
+    """(..., 3, 3) 1/(kg m^2), inverse inertia at the start of the step."""
+
+    def internal_gradient(self, velocities: Any, tension: Any) -> Any:
+        """Return minus the forces of elasticity, damping and muscles at the end of the step: (..., N, 3) N."""
+        ...
+
+
+@dataclass(frozen=True)
+class ImplicitStep(StepValues, BatchedRecord):
+    """The equation of one implicit step.
+
+    Implicit Euler alone loses angular momentum: with x+ = x + dt v the momentum changes by dt sum r x f, with the lever
+    arms r at the *start* of the step, about which the internal forces at its end have a torque. P^T removes that torque
+    as the inertial force of a rigid rotation, M (w x r): P v is v minus the rigid rotation with v's angular momentum.
+    So L+ = L + dt sum r x (f_contact - alpha M v) holds up to rounding, contact velocities are those that are solved
+    for, and ``momentum_correction`` is the angular velocity w of the removed rotation.
+    """
+
+    body: SoftBody
+    """The body."""
+    state: Any
+    """``BodyState`` at the start of the step, (..., N, 3)."""
+    dt: float
+    """Step size, s."""
+    drag: float = 0.0
+    """alpha of the Rayleigh damping (air drag), 1/s."""
+
+    @property
+    def momenta(self) -> Any:
+        """(..., 3, 3N) kg m, matrix that maps nodal velocities to the angular momentum about the centre of mass, with
+        lever arms r."""
+        return (self.rotation_modes * self.coordinate_mass[:, None]).swapaxes(-1, -2)
+
+    @property
+    def coordinate_mass(self) -> Any:
+        """(3N,) kg, mass of each coordinate."""
+        mass = self.node_mass
+        return array_module(mass).broadcast_to(mass[:, None], (len(mass), 3)).reshape(-1)
+
+    @property
+    def inertia_ratio(self) -> float:
+        """Factor 1 + dt alpha of the mass in the equation."""
+        return 1.0 + self.dt * self.drag
+
+    @property
+    def residual_scale(self) -> float:
+        """dt times the weight, N s, the unit of residual norms."""
+        return self.dt * self.body.weight
+
+    def end_positions(self, velocities: Any) -> Any:
+        """Return x + dt v (..., N, 3), m."""
+        return self.state.positions + self.dt * velocities
+
+    @property
+    def ballistic_positions(self) -> Any:
+        """(..., N, 3) m, end positions of the nodes without internal and contact forces."""
+        return self.end_positions(self.state.velocities + self.dt * self.gravity)
+
+    def momentum_correction(self, internal_gradient: Any) -> Any:
+        """Return the angular velocity (..., 3) rad/s of the rotation whose momentum implicit Euler alone would lose."""
+        flat = internal_gradient.reshape((*internal_gradient.shape[:-2], -1, 1))
+        return self.momentum_correction_from_torque((self.rotation_modes.swapaxes(-1, -2) @ flat)[..., 0])
+
+    def momentum_correction_from_torque(self, torque: Any) -> Any:
+        """Return ``momentum_correction`` of an internal gradient with ``torque`` (..., 3) N m about the centre of
+        mass."""
+        return self.dt * (self.inverse_inertia @ torque[..., None])[..., 0]
+
+    def residual(self, velocities: Any, tension: Any) -> Any:
+        """Return the left side minus the right side of the equation, without contact forces.
+
+        Args:
+            velocities: (..., N, 3) m/s, at the end of the step.
+            tension: muscles, as in ``internal_gradient``, or None.
+
+        Returns:
+            (..., N, 3) N s; not finite where an element is inverted.
+        """
+        internal = self.internal_gradient(velocities, tension)
+        correction = self.rotation_modes @ self.momentum_correction(internal)[..., None]
+        change = self.inertia_ratio * velocities - self.state.velocities - self.dt * self.gravity
+        return self.node_mass[:, None] * (change - correction.reshape(velocities.shape)) + self.dt * internal
+
+    def momentum_projection(self, momenta: Any, rotation_response: Any) -> MomentumProjection:
+        """Return the momentum projection of a tangent.
+
+        Args:
+            momenta: (..., 3N, 3), transpose of ``momenta``.
+            rotation_response: (..., 3N, 3), solutions of the tangent for the right-hand sides ``momenta``.
+        """
+        return MomentumProjection.of(self.rotation_modes, momenta, self.inertia_ratio, rotation_response)
