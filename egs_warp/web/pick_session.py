@@ -23,7 +23,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.picked import PickedFile, PickedObject, write_picked
 from egs_warp.io.planes import PlaneRecord
 from egs_warp.motions.repertoire import MOTIONS
-from egs_warp.pipelines.info import inspect_capture
+from egs_warp.pipelines.info import BodyInfo, inspect_capture
 from egs_warp.pipelines.pick import (
     Pick,
     PickHistory,
@@ -95,6 +95,8 @@ class PickSource:
     """Returns the objects to begin with, in the frame of the capture: of a file, or of the command line."""
     centre: np.ndarray | None = None
     """(3,) point at which the cameras look, in the frame of the page."""
+    film: str | None = None
+    """Motion of the film that is made after the page; None if the page starts ``commands``."""
 
 
 class PickSession:
@@ -115,6 +117,8 @@ class PickSession:
         self._is_stopping, self._unmeasured = False, threading.Event()
         self._busy = "preparing the capture"
         self._jobs: dict[str, Job] = {}
+        self.has_film_request = threading.Event()
+        """Set when the file is written and the film of ``PickSource.film`` is to be made."""
         self._thread = threading.Thread(target=self._run_loop, name="pick", daemon=True)
         self._measuring = threading.Thread(target=self._measure_loop, name="pick measurements", daemon=True)
 
@@ -343,9 +347,15 @@ class PickSession:
         return {
             **_NO_BODY,
             "rows": [["height", f"{height:.3g} units of the capture"], ["stands on", info.stands()]],
-            "motions": [{"name": n, "why": w} for n, w in info.motions().items() if MOTIONS[n].file is None],
+            "motions": self._motions(info),
             "front": (info.standing.frame.axes.T @ info.front.direction).tolist(),
         }
+
+    def _motions(self, info: BodyInfo) -> list[dict[str, str | None]]:
+        """Return the motions that the page offers, and those that the object cannot do with the reason."""
+        if self.source.film is not None:
+            return [{"name": self.source.film, "why": None}]
+        return [{"name": n, "why": w} for n, w in info.motions().items() if MOTIONS[n].file is None]
 
     # Called from the thread of the session.
 
@@ -380,6 +390,12 @@ class PickSession:
         pick = self.state.pick
         if not pick.mask.any():
             raise UserError("nothing is selected; click on the object first")
+        if kind == "animate" and self.source.film is not None:
+            self.save()
+            text = "is made in the terminal; this page can be closed"
+            self._send({"type": "animate", "text": text, "running": False, "failed": False})
+            self.has_film_request.set()
+            return
         running = self._jobs.get(kind)
         if running is not None and running.is_running:
             if kind == "animate":

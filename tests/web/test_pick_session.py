@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -140,3 +141,17 @@ def test_the_thread_sends_labels_state_and_measurements(tmp_path: Path):
         json.dumps(again)
     finally:
         session.stop()
+
+
+def test_before_a_film_the_page_offers_its_motion_and_ends(tmp_path: Path):
+    session, _ = picking(balls((-0.6, 0.9), between=1.6), tmp_path / "picked.json")
+    session.source = replace(session.source, film="hop x2")
+    session.prepare()
+    session.apply(mark(session, 0))
+    assert session._body_event(session.state.pick)["motions"] == [{"name": "hop x2", "why": None}]
+    assert not session.has_film_request.is_set()
+    session.apply(RunAnimate("hop x2"))
+    assert session.has_film_request.is_set()
+    assert read_picked(tmp_path / "picked.json", session.source.cloud).objects[0].gaussians[:EACH].mean() > 0.9
+    event = next(one for one in session.take_events() if one["type"] == "animate")
+    assert event["text"] == "is made in the terminal; this page can be closed" and not event["running"]
