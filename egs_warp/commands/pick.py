@@ -89,10 +89,8 @@ def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
     scene = read_scene(args)
     for note in scene.notes:
         print_note(note)
-    cloud, up = scene.cloud, scene.up
-    if scene.plane is None and up is None:
-        up, note = guessed_up(cloud)
-        print_note(note)
+    cloud = scene.cloud
+    up = scene.up if scene.plane is not None else _up_of(scene)
     kept = read_picked(args.out, cloud).objects if args.out.exists() else ()
 
     def first() -> Sequence[PickedObject]:
@@ -110,7 +108,8 @@ def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
         _Commands(args),
         first,
         None if centre is None else frame.points(centre),
-        film,
+        cameras=scene.cameras,
+        film=film,
     )
     camera = camera_facts(bounds, distance=_DISTANCE * DISTANCE)
     shown = still_run(placed, bounds, {"title": Path(args.capture).name, "picking": True, "camera": camera})
@@ -143,7 +142,7 @@ def pick_automatically(args: argparse.Namespace) -> None:
     from egs_warp.commands.scene_input import read_scene
     from egs_warp.io.picked import PickedFile, PickedObject, write_picked
     from egs_warp.io.planes import PlaneRecord
-    from egs_warp.pipelines.pick import pick_warnings, proposed
+    from egs_warp.pipelines.pick import edge_warnings, pick_warnings, proposed
     from egs_warp.segmentation.interactive import ClickGraph
 
     scene = read_scene(args)
@@ -152,10 +151,7 @@ def pick_automatically(args: argparse.Namespace) -> None:
     if scene.spec is not None:
         one = _given_object(scene)
     else:
-        up = scene.up
-        if up is None:
-            up, note = guessed_up(scene.cloud)
-            print_note(note)
+        up = _up_of(scene)
         graph = ClickGraph.of(scene.cloud)
         pick = proposed(graph, up, centre=_looked_at(scene.cameras))
         if not pick.mask.any():
@@ -163,10 +159,24 @@ def pick_automatically(args: argparse.Namespace) -> None:
                 f"{args.capture}: no object was found in the middle of the capture; leave out --yes and pick it on the"
                 " page, or give --object"
             )
-        for warning in pick_warnings(graph, pick):
-            print_note(f"the object: {warning}")
+        for warning in (*pick_warnings(graph, pick), *edge_warnings(scene.cloud, pick.mask, scene.cameras)):
+            print_note(f"the object: {warning}; leave out --yes to correct it on the page")
         one = PickedObject(pick.name, pick.mask, PlaneRecord(pick.plane), pick.front)
     write_picked(args.out, PickedFile(Path(args.capture).name, (one,)), scene.cloud)
+
+
+def _up_of(scene: SceneInput) -> np.ndarray:
+    """Return the up direction (3,) of ``--up``, of the capture's file, of the cameras, or estimated from its shape."""
+    from egs_warp.io import Capture
+    from egs_warp.pipelines.locate_plane import up_of_cameras
+
+    if scene.up is not None:
+        return scene.up
+    up = None if isinstance(scene.cloud, Capture) and scene.cloud.up is not None else up_of_cameras(scene.cameras)
+    if up is None:
+        up, note = guessed_up(scene.cloud)
+        print_note(note)
+    return up
 
 
 def _given_object(scene: SceneInput) -> PickedObject:

@@ -18,6 +18,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.picked import PickedFile, PickedObject, write_picked
@@ -28,6 +29,7 @@ from egs_warp.pipelines.pick import (
     Pick,
     PickHistory,
     PickState,
+    edge_warnings,
     marked,
     on_table_top,
     pick_warnings,
@@ -95,6 +97,8 @@ class PickSource:
     """Returns the objects to begin with, in the frame of the capture: of a file, or of the command line."""
     centre: np.ndarray | None = None
     """(3,) point at which the cameras look, in the frame of the page."""
+    cameras: Sequence[Camera] = ()
+    """Cameras of the capture, in its own frame; empty if they are not known."""
     film: str | None = None
     """Motion of the film that is made after the page; None if the page starts ``commands``."""
 
@@ -338,15 +342,22 @@ class PickSession:
         if not pick.mask.any():
             return _NO_BODY
         placed = self.source.placed
+        warnings = edge_warnings(self.source.cloud, pick.mask, self.source.cameras)
         above = pick.mask & (pick.plane.heights(placed.means.numpy()) > 0.0)
+        if not above.any():
+            return _NO_BODY
         try:
             info = inspect_capture(placed.subset(above), plane=pick.plane, front=pick.front, nodes=_MEASURE_NODES)
         except UserError as error:
-            return {**_NO_BODY, "rows": [["problem", str(error)]]}
+            return {**_NO_BODY, "rows": [["problem", text] for text in (*warnings, str(error))]}
         height = info.body.height / info.standing.frame.scale / self.source.frame.scale
         return {
             **_NO_BODY,
-            "rows": [["height", f"{height:.3g} units of the capture"], ["stands on", info.stands()]],
+            "rows": [
+                *(["problem", text] for text in warnings),
+                ["height", f"{height:.3g} units of the capture"],
+                ["stands on", info.stands()],
+            ],
             "motions": self._motions(info),
             "front": (info.standing.frame.axes.T @ info.front.direction).tolist(),
         }

@@ -40,7 +40,7 @@ class Photos:
     def run(self, *flags: str, source: Path | None = None, out: Path | None = None) -> int:
         """Run the command on the photos, with a short training and a short film."""
         words = ["from-photos", str(source or self.folder), "--out", str(out or self.out), "--yes", "--preview"]
-        return main([*words, "--iterations=40", "--gaussians=5000", "--motion=stand", "--up=z", *flags])
+        return main([*words, "--iterations=400", "--gaussians=5000", "--motion=stand", "--up=z", *flags])
 
     def model(self, *_: object, **__: object) -> SimpleNamespace:
         """Return a substitute for COLMAP's reconstruction: the true cameras, and the Gaussians as points."""
@@ -102,7 +102,7 @@ def test_an_interrupted_run_continues_and_finished_stages_are_used_again(
 
     def interrupted(args, *, say, show_step):
         def stop(step) -> None:
-            if step.done == 20:
+            if step.done == 200:
                 raise KeyboardInterrupt
 
         return run_train(args, say=say, show_step=stop)
