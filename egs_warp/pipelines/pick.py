@@ -10,11 +10,13 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera, downscale
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.meshing.body_gaussians import centred, representatives
 from egs_warp.pipelines.segmentation_warnings import views_at_edges
 from egs_warp.segmentation.base_plane import find_base_plane
 from egs_warp.segmentation.clicks import Click, click_at
+from egs_warp.segmentation.ground import measure_ground
 from egs_warp.segmentation.interactive import ClickGraph, segment_by_clicks
 from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.plane_search import find_planes
@@ -293,3 +295,26 @@ def edge_warnings(cloud: GaussianCloud, mask: np.ndarray, cameras: Sequence[Came
         f"it touches the picture's edges all round in {all_round} of {len(tested)} photos, so its surroundings are"
         " included; remove what does not belong to it",
     )
+
+
+def ground_around(
+    cloud: GaussianCloud, mask: np.ndarray, plane: Plane, cameras: Sequence[Camera] = ()
+) -> HeightField | None:
+    """Return the uneven ground about the object ``mask`` (n,) bool of ``cloud``, as ``animate`` measures it; None if it
+    is flat, or if there is nothing but the object.
+
+    Args:
+        cloud: the capture.
+        mask: the object.
+        plane: the plane under it.
+        cameras: cameras of the capture, if known.
+    """
+    if not mask.any() or mask.all():
+        return None
+    points = cloud.means.numpy()[mask].astype(np.float64)
+    low, high = np.quantile(points, [0.005, 0.995], axis=0)
+    size, height = float(np.linalg.norm(high - low)), float(np.quantile(plane.heights(points), 0.998))
+    if size == 0.0 or height <= 0.0:
+        return None
+    measured = measure_ground(cloud, mask, plane, cameras=cameras, centre=0.5 * (low + high), size=size)
+    return None if measured.is_flat(height) else measured.field

@@ -84,7 +84,9 @@ class SplatGraph:
 
     def where(self, chosen: np.ndarray) -> SplatGraph:
         """Return the graph with only the ``chosen`` (m,) bool links."""
-        return replace(self, **{name: getattr(self, name)[chosen] for name in ("first", "second", "length", "strength")})
+        return replace(
+            self, **{name: getattr(self, name)[chosen] for name in ("first", "second", "length", "strength")}
+        )
 
     def among(self, chosen: np.ndarray) -> SplatGraph:
         """Return the links between the ``chosen`` (n,) bool Gaussians, which are numbered in their order."""

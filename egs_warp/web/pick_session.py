@@ -30,6 +30,7 @@ from egs_warp.pipelines.pick import (
     PickHistory,
     PickState,
     edge_warnings,
+    ground_around,
     marked,
     on_table_top,
     pick_warnings,
@@ -37,6 +38,7 @@ from egs_warp.pipelines.pick import (
     resegmented,
     stroke_at,
 )
+from egs_warp.segmentation.ground import REACH
 from egs_warp.segmentation.interactive import ClickGraph
 from egs_warp.web.pick_jobs import Job
 from egs_warp.web.pick_messages import (
@@ -59,6 +61,9 @@ _MEASURE_DELAY = 0.8
 """Time without messages after which the active object is measured, s."""
 _NO_BODY: dict[str, Any] = {"type": "body", "rows": [], "motions": [], "front": None}
 """Event of an object without measurements."""
+_GRID_REACH, _GRID_STEP = 1.2, 2
+"""Half the side of the ground's grid for the page, in sizes of the object, and the number of measured nodes from one
+node of that grid to the next."""
 _MEASURE_NODES = 120
 """Approximate number of cage nodes with which it is measured; feet and motions hardly depend on it."""
 
@@ -284,6 +289,7 @@ class PickSession:
     def _show(self) -> None:
         """Send the current state to the page, and measure the active object later."""
         self._events.pop("body", None)
+        self._events.pop("ground", None)
         self._unmeasured.set()
         labels = base64.b64encode(self.state.labels().tobytes()).decode()
         self._send({"type": "labels", "data": labels})
@@ -336,6 +342,9 @@ class PickSession:
             # Measurements of an earlier selection are out of date.
             if self.state.pick is pick:
                 self._send(event)
+                grid = self.ground_grid(pick)
+                if self.state.pick is pick:
+                    self._send({"type": "ground", "grid": grid})
 
     def _body_event(self, pick: Pick) -> dict[str, Any]:
         """Return the event ``body``: size, support, front and possible motions of an object."""
@@ -360,6 +369,28 @@ class PickSession:
             ],
             "motions": self._motions(info),
             "front": (info.standing.frame.axes.T @ info.front.direction).tolist(),
+        }
+
+    def ground_grid(self, pick: Pick) -> dict[str, Any] | None:
+        """Return the uneven ground about an object in the frame of the page, with the heights of nodes row by row; None
+        if it is flat or there is no ground to measure."""
+        source, frame = self.source, self.source.frame
+        ground = ground_around(source.cloud, pick.mask, plane_in_capture(pick.plane, frame), source.cameras)
+        if ground is None:
+            return None
+        nodes = ground.nodes()
+        middle = len(nodes) // 2
+        reach = round(_GRID_REACH / REACH * middle)
+        rows = np.arange(middle - reach, middle + reach + 1, _GRID_STEP)
+        heights = ground.plane.heights(nodes[rows][:, rows]) * frame.scale
+        first = ground.origin + ground.spacing * rows[0] * (ground.axes[0] + ground.axes[1])
+        return {
+            "origin": frame.points(first).tolist(),
+            "first": (frame.axes @ ground.axes[0]).tolist(),
+            "second": (frame.axes @ ground.axes[1]).tolist(),
+            "spacing": _GRID_STEP * ground.spacing * frame.scale,
+            "count": len(rows),
+            "heights": np.round(heights, 5).ravel().tolist(),
         }
 
     def _motions(self, info: BodyInfo) -> list[dict[str, str | None]]:
