@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from argparse import Namespace
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from egs_warp.cli import main
-from egs_warp.commands.train import run_train
+from egs_warp.commands.train import TrainStep, run_train
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.io import read_capture
@@ -44,7 +45,7 @@ class Photos:
 
     def model(self, *_: object, **__: object) -> SimpleNamespace:
         """Return a substitute for COLMAP's reconstruction: the true cameras, and the Gaussians as points."""
-        cloud, _ = ball_on_floor()
+        cloud = ball_on_floor()[0]
         means, shades = cloud.means.numpy(), np.clip(255 * (0.5 + 0.28 * cloud.sh.numpy()[:, 0]), 0, 255).astype(int)
         one = self.cameras[0]
         images = []
@@ -98,16 +99,16 @@ def test_an_interrupted_run_continues_and_finished_stages_are_used_again(
     out = photos.out
     reconstruct_by(monkeypatch, photos.model)
     monkeypatch.setattr("egs_warp.training.checkpoint.SECONDS", 0.0)
-    resumed = []
+    resumed: list[bool] = []
 
-    def interrupted(args, *, say, show_step):
-        def stop(step) -> None:
+    def interrupted(args: Namespace, *, say: Callable[[str], None], show_step: object) -> list[str]:
+        def stop(step: TrainStep) -> None:
             if step.done == 200:
                 raise KeyboardInterrupt
 
         return run_train(args, say=say, show_step=stop)
 
-    def watched(args, *, say, show_step):
+    def watched(args: Namespace, *, say: Callable[[str], None], show_step: Callable[[TrainStep], None]) -> list[str]:
         resumed.append(args.resume)
         return run_train(args, say=say, show_step=show_step)
 
