@@ -89,7 +89,7 @@ class _Overview(_Parser):
         helps = {action.dest: action.help for action in subparsers._get_subactions()}
         lines = [f"usage: {self.prog} [--version] COMMAND ...", "", str(self.description)]
         for group, names in GROUPS.items():
-            lines += ["", f"{group}:", *(f"  {name:<10}{helps[name]}" for name in names)]
+            lines += ["", f"{group}:", *(f"  {name:<13}{helps[name]}" for name in names)]
         lines += [
             "",
             f"{self.prog} COMMAND --help describes the flags of a command, with examples.",
@@ -108,8 +108,8 @@ _EXIT_STATUSES = """exit status:
   0    done
   1    out of memory or disk space, or a disk error; doctor: a required component is missing
   2    invalid input; the message says what to change
-  3    animate, resume: the files are written, but the body fell or missed its target, or a step
-       could not be solved
+  3    animate, resume, from-photos: the files are written, but the body fell or missed its target,
+       or a step could not be solved
   130  stopped by Ctrl-C; no half-written file is left
   143  stopped by SIGTERM; no half-written file is left"""
 
@@ -134,7 +134,7 @@ def _parsers() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentP
     parser.add_argument("--version", action="version", version=f"egs-warp {__version__}")
     subparsers = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
     for name in COMMANDS:
-        module = importlib.import_module(f"egs_warp.commands.{name}")
+        module = importlib.import_module(f"egs_warp.commands.{name.replace('-', '_')}")
         module.add_parser(subparsers)
         command = subparsers.choices[name]
         command.complete_help = getattr(module, "complete_help", None)

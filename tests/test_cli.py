@@ -304,7 +304,7 @@ def _examples() -> list[str]:
     commands = [
         f"{name} {example}"
         for name in COMMANDS
-        for example in importlib.import_module(f"egs_warp.commands.{name}").EXAMPLES
+        for example in importlib.import_module(f"egs_warp.commands.{name.replace('-', '_')}").EXAMPLES
     ]
     return [*commands, *_FIRST_EXAMPLES]
 

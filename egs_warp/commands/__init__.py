@@ -5,7 +5,7 @@ Input: command-line flags. Output: files and an exit status. No other package ha
 
 GROUPS = {
     "getting started": ("doctor", "demo", "samples"),
-    "captures": ("pose", "train", "convert"),
+    "captures": ("from-photos", "pose", "train", "convert"),
     "scenes": ("pick", "plane", "segment", "inpaint"),
     "motion": ("info", "muscles", "animate", "resume", "live"),
     "finished runs": ("render", "view", "export", "validate"),
@@ -13,4 +13,4 @@ GROUPS = {
 """Command names by group, in the order of ``egs-warp --help``."""
 
 COMMANDS = tuple(name for names in GROUPS.values() for name in names)
-"""All command names; each is a module of this package."""
+"""All command names; each is a module of this package, with underscores for hyphens."""

@@ -24,6 +24,7 @@ from egs_warp.commands.scene_flags import (
     add_object_flags,
     add_overwrite_flag,
     check_no_scene_flags,
+    print_above_bars,
     print_note,
     start_device,
 )
@@ -220,8 +221,8 @@ def run_animate(args: argparse.Namespace) -> int:
         if not args.overwrite and (args.out / NAME).is_file():
             error.add_note(f"egs-warp resume {args.out} continues it")
         raise
-    print(report.summary())
-    print(f"film: {args.out / str(report.film)} (sheet.png, plots.png and report.json are beside it)")
+    print_above_bars(report.summary())
+    print_above_bars(f"film: {args.out / str(report.film)} (sheet.png, plots.png and report.json are beside it)")
     return EXIT_NOT_AS_REQUESTED if report.state.is_failure else 0
 
 
@@ -232,7 +233,7 @@ def _animate_capture(args: argparse.Namespace) -> Report:
     from egs_warp.io.video import ffmpeg_program
 
     check_no_scene_flags(args)
-    options = _options(args)
+    options = animate_options(args)
     shot, background_path = shot_of(args)
     ffmpeg_program()
     start_device(args.device)
@@ -272,7 +273,7 @@ def _animate_scene(args: argparse.Namespace) -> Report:
     shot, _ = shot_of(args)
     if args.inpainter is not None and args.no_inpaint:
         raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
-    options = _options(args)
+    options = animate_options(args)
     ffmpeg_program()
     start_device(args.device)
     inpainter = chosen_inpainter(args)
@@ -372,7 +373,7 @@ def _write_pictures(run: RunFolder, scene_input: SceneInput, scene: PreparedScen
         write_png(run.file(name), picture)
 
 
-def _options(args: argparse.Namespace) -> AnimateOptions:
+def animate_options(args: argparse.Namespace) -> AnimateOptions:
     """Return the options that the flags define without the capture. Raises ``UserError`` for invalid flags."""
     from egs_warp.contact.terrain import read_terrain
     from egs_warp.io.text import parse_json, read_text

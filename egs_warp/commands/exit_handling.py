@@ -1,7 +1,7 @@
 """Exit handling: every error or signal prints one line, leaves no half-written file and sets the exit status.
 
 Exit statuses: 0 done, 1 out of memory or disk space, 2 invalid input, 3 files written but target missed, body fallen or
-simulation stopped (``animate``, ``resume``), 130 Ctrl-C, 143 SIGTERM.
+simulation stopped (``animate``, ``resume``, ``from-photos``), 130 Ctrl-C, 143 SIGTERM.
 """
 
 from __future__ import annotations

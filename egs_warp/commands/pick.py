@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from egs_warp.commands.flags import Commands, guessed_up, named_path
 from egs_warp.commands.live import wait_for_end
-from egs_warp.commands.scene_flags import add_object_flags, print_note
+from egs_warp.commands.scene_flags import add_object_flags, print_above_bars, print_note
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
@@ -25,6 +27,8 @@ EXAMPLES = (
     "room.ply --cameras POSED --out out/toy/picked.json",
     "room.ply --object 0,0,0.5",
 )
+_LAST_LINE = 1.0
+"""Time for which the page can receive its last line, s."""
 _DISTANCE = 1.25
 """Distance of the initial camera relative to that of a preview, which leaves space for the arrows."""
 
@@ -51,6 +55,21 @@ def add_parser(commands: Commands) -> None:
 
 
 def _pick(args: argparse.Namespace) -> int:
+    pick_on_page(args)
+    return 0
+
+
+def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
+    """Open the page and wait until it ends.
+
+    Args:
+        args: the flags of ``egs-warp pick``.
+        film: motion of the film that the caller makes after the page; None if the page itself starts commands until
+            Ctrl-C.
+
+    Returns:
+        True if the user has requested the film, so that ``args.out`` is written; False if the server has ended.
+    """
     import webbrowser
 
     from egs_warp.commands.scene_input import read_scene
@@ -70,10 +89,8 @@ def _pick(args: argparse.Namespace) -> int:
     scene = read_scene(args)
     for note in scene.notes:
         print_note(note)
-    cloud, up = scene.cloud, scene.up
-    if scene.plane is None and up is None:
-        up, note = guessed_up(cloud)
-        print_note(note)
+    cloud = scene.cloud
+    up = scene.up if scene.plane is not None else _up_of(scene)
     kept = read_picked(args.out, cloud).objects if args.out.exists() else ()
 
     def first() -> Sequence[PickedObject]:
@@ -91,21 +108,75 @@ def _pick(args: argparse.Namespace) -> int:
         _Commands(args),
         first,
         None if centre is None else frame.points(centre),
+        cameras=scene.cameras,
+        film=film,
     )
     camera = camera_facts(bounds, distance=_DISTANCE * DISTANCE)
     shown = still_run(placed, bounds, {"title": Path(args.capture).name, "picking": True, "camera": camera})
     session = PickSession(source)
     server = PageServer([], port=args.port, feed=PickFeed(session, shown))
     with server.serve_in_background() as thread:
-        print(f"open {server.address}\nend with Ctrl-C", flush=True)
+        how = "end with Ctrl-C" if film is None else f"pick the object, then press Animate; the motion is {film}"
+        print_above_bars(f"open {server.address}\n{how}")
+        sys.stdout.flush()
         if not args.no_browser:
             webbrowser.open(server.address)
         session.start()
         try:
-            wait_for_end(thread)
+            if film is None:
+                wait_for_end(thread)
+            else:
+                while thread.is_alive() and not session.has_film_request.wait(timeout=0.5):
+                    pass
+                time.sleep(_LAST_LINE)
         finally:
             session.stop()
-    return 0
+    return session.has_film_request.is_set()
+
+
+def pick_automatically(args: argparse.Namespace) -> None:
+    """Write ``args.out`` with the object of ``--object``, or with the first proposal of the page.
+
+    Raises ``UserError`` if there is no object in the middle of the capture.
+    """
+    from egs_warp.commands.scene_input import read_scene
+    from egs_warp.io.picked import PickedFile, PickedObject, write_picked
+    from egs_warp.io.planes import PlaneRecord
+    from egs_warp.pipelines.pick import edge_warnings, pick_warnings, proposed
+    from egs_warp.segmentation.interactive import ClickGraph
+
+    scene = read_scene(args)
+    for note in scene.notes:
+        print_note(note)
+    if scene.spec is not None:
+        one = _given_object(scene)
+    else:
+        up = _up_of(scene)
+        graph = ClickGraph.of(scene.cloud)
+        pick = proposed(graph, up, centre=_looked_at(scene.cameras))
+        if not pick.mask.any():
+            raise UserError(
+                f"{args.capture}: no object was found in the middle of the capture; leave out --yes and pick it on the"
+                " page, or give --object"
+            )
+        for warning in (*pick_warnings(graph, pick), *edge_warnings(scene.cloud, pick.mask, scene.cameras)):
+            print_note(f"the object: {warning}; leave out --yes to correct it on the page")
+        one = PickedObject(pick.name, pick.mask, PlaneRecord(pick.plane), pick.front)
+    write_picked(args.out, PickedFile(Path(args.capture).name, (one,)), scene.cloud)
+
+
+def _up_of(scene: SceneInput) -> np.ndarray:
+    """Return the up direction (3,) of ``--up``, of the capture's file, of the cameras, or estimated from its shape."""
+    from egs_warp.io import Capture
+    from egs_warp.pipelines.locate_plane import up_of_cameras
+
+    if scene.up is not None:
+        return scene.up
+    up = None if isinstance(scene.cloud, Capture) and scene.cloud.up is not None else up_of_cameras(scene.cameras)
+    if up is None:
+        up, note = guessed_up(scene.cloud)
+        print_note(note)
+    return up
 
 
 def _given_object(scene: SceneInput) -> PickedObject:

@@ -10,10 +10,6 @@ from egs_warp.commands.flags import Commands, named_path, seed
 from egs_warp.commands.scene_flags import add_overwrite_flag
 from egs_warp.errors import UserError
 
-_MAX_NAMES = 5
-"""Maximum number of photos without a pose that are listed by name; the others are counted."""
-
-
 EXAMPLES = (
     "photos --out posed",
     "walkaround.mp4 --frames 200 --out posed",
@@ -58,15 +54,7 @@ def _pose(args: argparse.Namespace) -> int:
         progress=progress.step,
     )
     progress.end()
-    print(
-        f"estimated the poses of {result.registered} of {result.photos} photos"
-        f" ({100 * result.registered / result.photos:.0f} %),"
-        f" {result.points} points, reprojection error {result.error:.2f} pixels"
-    )
-    if result.without_pose:
-        names = ", ".join(result.without_pose[:_MAX_NAMES])
-        more = len(result.without_pose) - _MAX_NAMES
-        print(f"without a pose: {names}{f' and {more} more' if more > 0 else ''}")
+    print(*result.summary(), sep="\n")
     print(f"wrote {args.out}; next step: egs-warp train {args.out} --out capture.ply")
     return 0
 

@@ -29,20 +29,14 @@ def add_parser(commands: Commands) -> None:
 
 def _resume(args: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import clean_up, has_finished
-    from egs_warp.io.text import parse_json, read_text
-    from egs_warp.pipelines.end_state import State
     from egs_warp.pipelines.finished_run import PARTS
 
     folder: Path = args.folder
     if has_finished(folder):
-        report = parse_json(read_text(folder / "report.json"), folder / "report.json")
+        status = status_of_finished(folder)
         clean_up(folder, PARTS)
         print(f"{folder}: this run has finished")
-        return (
-            EXIT_NOT_AS_REQUESTED
-            if isinstance(report, dict) and report.get("state") in [state.value for state in State if state.is_failure]
-            else 0
-        )
+        return status
     config = folder / NAME
     if not config.is_file():
         raise UserError(f"{config}: is missing; the run was interrupted before its first step; start it again")
@@ -54,3 +48,13 @@ def _resume(args: argparse.Namespace) -> int:
             f"{run.capture}: differs from the capture of the run; restore that file, or start the run again"
         )
     return run_animate(run)
+
+
+def status_of_finished(folder: Path) -> int:
+    """Return the exit status of the finished run of ``animate`` in ``folder``."""
+    from egs_warp.io.text import parse_json, read_text
+    from egs_warp.pipelines.end_state import State
+
+    report = parse_json(read_text(folder / "report.json"), folder / "report.json")
+    failures = [state.value for state in State if state.is_failure]
+    return EXIT_NOT_AS_REQUESTED if isinstance(report, dict) and report.get("state") in failures else 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from typing import TextIO
 
 from egs_warp.commands.flags import named_path
 from egs_warp.errors import UserError
@@ -79,5 +80,13 @@ def start_device(device: str) -> None:
 
 
 def print_note(text: str) -> None:
-    """Print one line for the user on stderr."""
-    print(f"egs-warp: {text}", file=sys.stderr)
+    """Print one line for the user on stderr, above a progress bar."""
+    print_above_bars(f"egs-warp: {text}", file=sys.stderr)
+
+
+def print_above_bars(text: str, *, file: TextIO | None = None) -> None:
+    """Print a line on ``file`` (default stdout), above a progress bar."""
+    from tqdm import tqdm
+
+    with tqdm.external_write_mode(file=file):
+        print(text, file=file)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.camera_flags import COLOURS, parse_colour
@@ -74,6 +76,27 @@ def add_parser(commands: Commands) -> None:
 
 
 def _train(args: argparse.Namespace) -> int:
+    progress = _Progress()
+    try:
+        lines = run_train(args, say=progress.say, show_step=progress.step)
+    except BaseException as error:
+        if args.out.with_name(f"{args.out.name.split('.')[0]}.training.npz").is_file():
+            error.add_note("continue with --resume and the same flags")
+        raise
+    print(*lines, sep="\n")
+    return 0
+
+
+def run_train(
+    args: argparse.Namespace, *, say: Callable[[str], None], show_step: Callable[[TrainStep], None]
+) -> list[str]:
+    """Run ``egs-warp train`` and return the lines of its summary.
+
+    Args:
+        args: the flags.
+        say: called with a description of each stage as it starts.
+        show_step: called after each step.
+    """
     background = parse_colour(args.background) if args.background is not None else None
     if background is None and args.background is not None:
         raise UserError(f"--background {args.background}: give a colour: {COLOURS}")
@@ -94,8 +117,7 @@ def _train(args: argparse.Namespace) -> int:
     sheet, report_path = args.out.with_name(f"{stem}.sheet.png"), args.out.with_name(f"{stem}.report.json")
     checkpoint = args.out.with_name(f"{stem}.training.npz")
     if args.resume and args.out.exists() and not checkpoint.exists():
-        print(f"{args.out}: this training has finished")
-        return 0
+        return [f"{args.out}: this training has finished"]
     if checkpoint.exists() and not (args.resume or args.overwrite):
         raise UserError(
             f"--out {args.out}: its training was interrupted; give --resume to continue it, or --overwrite to start"
@@ -123,34 +145,29 @@ def _train(args: argparse.Namespace) -> int:
     read_cameras(args.posed)
     iterations, gaussians, side = _DEFAULTS["cuda" if args.device.startswith("cuda") else "cpu"]
     iterations = args.iterations or iterations
-    progress = _Progress(iterations)
+    pace = _Pace(iterations, show_step)
     began = time.perf_counter()
     with named_files(*outputs, overwrite=overwrite) as files:
-        try:
-            result = train(
-                args.posed,
-                iterations=iterations,
-                max_gaussians=args.gaussians or gaussians,
-                sh_degree=args.sh_degree,
-                background=background,
-                max_side=args.max_side or side,
-                inverted_masks=None if args.mask_object is None else args.mask_object == "black",
-                seed=args.seed,
-                device=args.device,
-                checkpoint=checkpoint,
-                resume=args.resume,
-                progress=progress.step,
-                stage=progress.say,
-            )
-        except BaseException as error:
-            if checkpoint.is_file():
-                error.add_note("continue with --resume and the same flags")
-            raise
-        progress.say(f"writing {args.out}")
+        result = train(
+            args.posed,
+            iterations=iterations,
+            max_gaussians=args.gaussians or gaussians,
+            sh_degree=args.sh_degree,
+            background=background,
+            max_side=args.max_side or side,
+            inverted_masks=None if args.mask_object is None else args.mask_object == "black",
+            seed=args.seed,
+            device=args.device,
+            checkpoint=checkpoint,
+            resume=args.resume,
+            progress=pace.step,
+            stage=say,
+        )
+        say(f"writing {args.out}")
         report = TrainReport.of(
             result,
             seconds=time.perf_counter() - began,
-            frames_per_second=progress.frames_per_second,
+            frames_per_second=pace.frames_per_second,
             device=args.device,
             seed=args.seed,
             sh_degree=args.sh_degree,
@@ -163,43 +180,64 @@ def _train(args: argparse.Namespace) -> int:
         # The checkpoint is needed only to resume.
         checkpoint.unlink(missing_ok=True)
     wrote = f"wrote {args.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json"
-    print(*report.summary(), wrote, sep="\n")
-    return 0
+    return [*report.summary(), wrote]
+
+
+@dataclass(frozen=True)
+class TrainStep:
+    """Progress of a training."""
+
+    done: int
+    """Number of finished steps."""
+    iterations: int
+    loss: float
+    frames_per_second: float
+    """Training steps per second."""
+
+
+class _Pace:
+    """Speed of a training. The first step is not timed, because it may compile kernels."""
+
+    def __init__(self, iterations: int, show_step: Callable[[TrainStep], None]) -> None:
+        self._iterations, self._show_step = iterations, show_step
+        self._first: float | None = None
+        self._before = 0
+        self.frames_per_second = 0.0
+        """Training steps per second."""
+
+    def step(self, step: int, loss: float) -> None:
+        """Show step ``step`` and its ``loss``."""
+        now = time.perf_counter()
+        if self._first is None:
+            self._first, self._before = now, step
+            return
+        self.frames_per_second = (step - self._before) / max(now - self._first, 1e-9)
+        self._show_step(TrainStep(step + 1, self._iterations, loss, self.frames_per_second))
 
 
 class _Progress:
     """Progress on stderr: one updated line on a terminal, otherwise a line for every tenth of the training."""
 
-    def __init__(self, iterations: int) -> None:
-        self._iterations = iterations
+    def __init__(self) -> None:
         self._terminal = sys.stderr.isatty()
-        self._first: float | None = None
-        self._before = 0
         self._shown = 0.0
-        self.frames_per_second = 0.0
-        """Training steps per second, not counting the first step."""
 
     def say(self, stage: str) -> None:
         """Report the start of ``stage``."""
         print(f"egs-warp: {stage}", file=sys.stderr)
 
-    def step(self, step: int, loss: float) -> None:
-        """Report step ``step`` and its ``loss``. The first step is not timed, because it may compile kernels."""
+    def step(self, step: TrainStep) -> None:
+        """Report a step."""
         now = time.perf_counter()
-        done = step + 1
-        if self._first is None:
-            self._first, self._before = now, step
-            return
-        self.frames_per_second = (step - self._before) / max(now - self._first, 1e-9)
-        last = done == self._iterations
-        due = now - self._shown > 0.5 if self._terminal else done % max(1, self._iterations // 10) == 0
+        last = step.done == step.iterations
+        due = now - self._shown > 0.5 if self._terminal else step.done % max(1, step.iterations // 10) == 0
         if not (due or last):
             return
         self._shown = now
-        left = round((self._iterations - done) / self.frames_per_second)
+        left = round((step.iterations - step.done) / step.frames_per_second)
         text = (
-            f"egs-warp: training {done}/{self._iterations}, loss {loss:.4f},"
-            f" {self.frames_per_second:.1f} frames/s, {left // 60}:{left % 60:02d} left"
+            f"egs-warp: training {step.done}/{step.iterations}, loss {step.loss:.4f},"
+            f" {step.frames_per_second:.1f} frames/s, {left // 60}:{left % 60:02d} left"
         )
         end = "\n" if last or not self._terminal else ""
         print(f"\r{text}\x1b[K" if self._terminal else text, end=end, file=sys.stderr, flush=True)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import warp as wp
-from tqdm import tqdm
 
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
@@ -26,6 +25,7 @@ from egs_warp.lighting.remaining_shadow import without_shadow
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.progress import render_bar
 from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
 from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, FILMED_FROM, SimulatedRun
 from egs_warp.render.backdrop import Backdrop, captured_scene, plain_colour, studio_floor
@@ -147,7 +147,7 @@ def draw_film(
     path = run.file(f"{name}.{'mov' if shot.transparent else 'mp4'}")
     with (
         _writer(path, cameras[0], shot) as video,
-        tqdm(total=len(steps), desc="render", unit="frame", disable=quiet) as bar,
+        render_bar(len(steps), quiet=quiet) as show_image,
     ):
         for index, frame in enumerate(frames):
             started = time.perf_counter()
@@ -158,7 +158,7 @@ def draw_film(
             encoding = 1e3 * (time.perf_counter() - started)
             for stage, spent in zip(milliseconds, (*frame.milliseconds, encoding), strict=True):
                 milliseconds[stage].append(spent)
-            bar.update()
+            show_image()
     labels = [f"{trajectory.time[steps[i]]:.2f} s" for i in sheet_indices]
     write_png(run.file("sheet.png"), contact_sheet(sheet_images, 4, labels))
     milliseconds["split"] = [splitting / len(steps)]

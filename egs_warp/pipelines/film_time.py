@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 
@@ -43,9 +42,7 @@ class FilmTimeNote:
         simulation = (time.perf_counter() - self._started) / (_FIRST_FRAMES - _SETUP_FRAMES)
         if self._seconds > simulation:
             film, run = (tqdm.format_interval(each * expected) for each in (self._seconds, simulation))
-            # The line appears above the bar, which is drawn again below it.
-            with tqdm.external_write_mode(file=sys.stderr):
-                self._show_note(
-                    f"the film takes about {film}, after {run} of simulation; a preview draws it smaller and with fewer"
-                    " Gaussians"
-                )
+            self._show_note(
+                f"the film takes about {film}, after {run} of simulation; a preview draws it smaller and with fewer"
+                " Gaussians"
+            )

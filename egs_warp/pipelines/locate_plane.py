@@ -235,20 +235,28 @@ def _middle(cloud: GaussianCloud, segmentation: Segmentation) -> np.ndarray:
     return 0.5 * (np.quantile(means, 0.01, axis=0) + np.quantile(means, 0.99, axis=0))
 
 
+def up_of_cameras(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """Return the up direction (3,) of ``cameras`` that photographers hold upright; None if they do not define one."""
+    if len(cameras) < 3:
+        return None
+    # The image x axes span the level plane.
+    rights = np.stack([camera.rotation[0] for camera in cameras])
+    values, vectors = np.linalg.eigh(rights.T @ rights)
+    if values[0] >= 0.1 * values[1]:
+        return None
+    ups = -np.stack([camera.rotation[1] for camera in cameras]).mean(axis=0)
+    return vectors[:, 0] * (1.0 if vectors[:, 0] @ ups > 0 else -1.0)
+
+
 def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray, str, float]:
     """Estimate up.
 
     Returns:
         (3,) up, the reason for it, and the maximum tilt of a level plane against it, degrees.
     """
-    if len(cameras) >= 3:
-        # Photographers hold cameras upright, so the image x axes span the level plane.
-        rights = np.stack([camera.rotation[0] for camera in cameras])
-        values, vectors = np.linalg.eigh(rights.T @ rights)
-        ups = -np.stack([camera.rotation[1] for camera in cameras]).mean(axis=0)
-        if values[0] < 0.1 * values[1]:
-            axis = vectors[:, 0]
-            return axis * (1.0 if axis @ ups > 0 else -1.0), "the cameras are held upright", _MAX_TILT_OF_CAMERAS
+    up = up_of_cameras(cameras)
+    if up is not None:
+        return up, "the cameras are held upright", _MAX_TILT_OF_CAMERAS
     vertical_axis = cloud.vertical_axis if isinstance(cloud, Capture) else None
     return *guess_up(cloud, tilted=False, vertical_axis=vertical_axis), _MAX_TILT
 

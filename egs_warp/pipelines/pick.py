@@ -8,12 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import Camera, downscale
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.meshing.body_gaussians import centred, representatives
+from egs_warp.pipelines.segmentation_warnings import views_at_edges
 from egs_warp.segmentation.base_plane import find_base_plane
 from egs_warp.segmentation.clicks import Click, click_at
+from egs_warp.segmentation.ground import measure_ground
 from egs_warp.segmentation.interactive import ClickGraph, segment_by_clicks
 from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.plane_search import find_planes
@@ -32,6 +35,8 @@ _MAX_SHARE = 1.0 / 3.0
 """Share of the capture above which an object is reported as large, if it is also wide."""
 _MAX_EXTENT = 0.6
 """Fraction of the capture's diagonal along the ground above which an object is wide."""
+_VIEWS, _SIDE = 6, 160
+"""Number of cameras, and longer side in pixels, in which the edges of the pictures are tested."""
 _SEED_COUNT = 8
 """Number of Gaussians next to the middle of a scene from which the proposal starts."""
 _OPAQUE = 0.3
@@ -270,7 +275,46 @@ def pick_warnings(graph: ClickGraph, pick: Pick) -> tuple[str, ...]:
         share = 100.0 * count / len(pick.mask)
         warnings.append(f"it has {share:.0f} % of the capture; if other things lit up, remove them")
     size = size_of(graph, pick)
+    if not (pick.plane.heights(graph.means[pick.mask]) > 0.0).any():
+        warnings.append("nothing of it is above the ground; drag the ground down, or click on the object")
+        return tuple(warnings)
     lowest = float(np.quantile(pick.plane.heights(graph.means[pick.mask]), 0.002))
     if lowest > 0.1 * size:
         warnings.append(f"it hangs {lowest / size:.2f} of its size above the ground; drag the ground to its feet")
     return tuple(warnings)
+
+
+def edge_warnings(cloud: GaussianCloud, mask: np.ndarray, cameras: Sequence[Camera]) -> tuple[str, ...]:
+    """Return a warning with a remedy if the object ``mask`` (n,) bool of ``cloud`` touches the edges of some pictures
+    all round, as a room does."""
+    tested = [downscale(camera, _SIDE) for camera in cameras[:: max(1, len(cameras) // _VIEWS)]][:_VIEWS]
+    all_round, _ = views_at_edges(cloud.subset(mask), tested)
+    if all_round == 0:
+        return ()
+    return (
+        f"it touches the picture's edges all round in {all_round} of {len(tested)} photos, so its surroundings are"
+        " included; remove what does not belong to it",
+    )
+
+
+def ground_around(
+    cloud: GaussianCloud, mask: np.ndarray, plane: Plane, cameras: Sequence[Camera] = ()
+) -> HeightField | None:
+    """Return the uneven ground about the object ``mask`` (n,) bool of ``cloud``, as ``animate`` measures it; None if it
+    is flat, or if there is nothing but the object.
+
+    Args:
+        cloud: the capture.
+        mask: the object.
+        plane: the plane under it.
+        cameras: cameras of the capture, if known.
+    """
+    if not mask.any() or mask.all():
+        return None
+    points = cloud.means.numpy()[mask].astype(np.float64)
+    low, high = np.quantile(points, [0.005, 0.995], axis=0)
+    size, height = float(np.linalg.norm(high - low)), float(np.quantile(plane.heights(points), 0.998))
+    if size == 0.0 or height <= 0.0:
+        return None
+    measured = measure_ground(cloud, mask, plane, cameras=cameras, centre=0.5 * (low + high), size=size)
+    return None if measured.is_flat(height) else measured.field

@@ -40,6 +40,10 @@ _POLL_RATE = 2.0
 """Rate at which the progress is read, Hz."""
 
 
+_MAX_NAMES = 5
+"""Maximum number of photos without a pose that a summary lists by name; the others are counted."""
+
+
 @dataclass(frozen=True)
 class PoseResult:
     """Summary of a reconstruction."""
@@ -57,6 +61,19 @@ class PoseResult:
     error: float
     """Mean reprojection error, pixels."""
 
+    def summary(self) -> list[str]:
+        """Return lines for the terminal."""
+        lines = [
+            f"estimated the poses of {self.registered} of {self.photos} photos"
+            f" ({100 * self.registered / self.photos:.0f} %), {self.points} points, reprojection error"
+            f" {self.error:.2f} pixels"
+        ]
+        if self.without_pose:
+            more = len(self.without_pose) - _MAX_NAMES
+            names = ", ".join(self.without_pose[:_MAX_NAMES])
+            lines.append(f"without a pose: {names}{f' and {more} more' if more > 0 else ''}")
+        return lines
+
 
 def pose_photos(
     source: Path | str,
@@ -66,6 +83,7 @@ def pose_photos(
     max_side: int = 1600,
     seed: int = 0,
     overwrite: bool = False,
+    resume: bool | None = None,
     stage: Callable[[str], None] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> PoseResult:
@@ -81,6 +99,8 @@ def pose_photos(
         max_side: Longer side of the images in which features are detected, pixels.
         seed: Seed of COLMAP.
         overwrite: Move an earlier run in ``out`` aside.
+        resume: True uses the features and matches of an interrupted run with the same arguments; True and False keep
+            them if this run is interrupted; None does not keep them.
         stage: Called with a description of each stage as it starts.
         progress: Called with the name of a stage, the number of its finished items, and their total number.
 
@@ -98,7 +118,7 @@ def pose_photos(
     if not source.is_dir() and not is_video:
         raise UserError(f"{source}: neither a folder of photos nor a video ({', '.join(VIDEO_SUFFIXES)})")
     check_run_folder(out, overwrite=overwrite, writes=_WRITES)
-    with run_folder(out, command="pose", overwrite=overwrite) as run, _work_folder(run.path) as work:
+    with run_folder(out, command="pose", overwrite=overwrite) as run, _work_folder(run.path, resume) as work:
         images = work / "images"
         images.mkdir()
         say(f"choosing {frames} frames of {source}" if is_video else f"reading {source}")
@@ -152,12 +172,30 @@ def _write_model(model: Any, folder: Path, out: Path | str) -> None:
 
 
 @contextmanager
-def _work_folder(folder: Path) -> Iterator[Path]:
-    """Create a temporary folder in the locked ``folder``, after removing those of killed runs."""
+def _work_folder(folder: Path, resume: bool | None) -> Iterator[Path]:
+    """Create a temporary folder in the locked ``folder``, after removing those of killed runs.
+
+    With ``resume`` True, the database of an interrupted run stays; with True or False, this folder stays if a signal
+    or a crash ends the run.
+    """
+    kept = folder / f"{_WORK_PREFIX}kept"
     for remnant in folder.glob(f"{_WORK_PREFIX}*"):
-        shutil.rmtree(remnant, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=_WORK_PREFIX) as work:
-        yield Path(work)
+        if remnant != kept or not resume:
+            shutil.rmtree(remnant, ignore_errors=True)
+    if resume is None:
+        with tempfile.TemporaryDirectory(dir=folder, prefix=_WORK_PREFIX) as work:
+            yield Path(work)
+        return
+    kept.mkdir(exist_ok=True)
+    # Photos are copied again, because the copies may be incomplete; COLMAP skips features and matches that it has.
+    for part in ("images", "models", "sparse"):
+        shutil.rmtree(kept / part, ignore_errors=True)
+    try:
+        yield kept
+    except Exception:
+        shutil.rmtree(kept, ignore_errors=True)
+        raise
+    shutil.rmtree(kept)
 
 
 def _copied(source: Path, images: Path) -> tuple[str, ...]:

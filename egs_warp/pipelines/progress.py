@@ -1,10 +1,15 @@
-"""Progress bars with calibrated remaining times: for scenes, ``info``, conversions, creatures and simulations."""
+"""Progress bars with calibrated remaining times: for scenes, ``info``, conversions, creatures, simulations and films.
+
+Inside of ``photos_bar``, all other bars report to it instead of appearing.
+"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
 from itertools import accumulate
 from threading import Event, Thread
 from types import TracebackType
@@ -23,6 +28,8 @@ degree 3 on a CPU)."""
 _SCENE_SHARES = {"plane": 12, "ground": 15, "segment": 49, "inpaint": 24}
 """Percent of the time that each stage of a scene takes: median of two built-in scenes, koala and narcissus on a CPU;
 stages start within 16 of these."""
+_PHOTOS_SHARES = {"pose": 20, "train": 50, "pick": 1, "scene": 15, "prepare": 2, "simulate": 7, "render": 5}
+"""Percent of the time that each stage from photos to a film takes on a CPU."""
 _UNTRAINED_SHARE = 2
 """Percent of the time that a stage takes without its training."""
 _SMOOTHING = 0.05
@@ -35,6 +42,43 @@ _MIN_LEFT = 0.3
 not end at once."""
 _RELIABLE_FRACTION = 0.1
 """Finished fraction of a stage from which its own pace counts, not its usual share."""
+_UPDATE_INTERVAL, _LOG_INTERVAL = 0.25, 10.0
+"""Seconds between two updates of ``photos_bar`` on a terminal, and in a log."""
+_outer: ContextVar[PhotosBar | None] = ContextVar("_outer", default=None)
+"""The bar to which other bars report; None if they appear themselves."""
+
+
+@contextmanager
+def photos_bar(stages: Sequence[str], *, quiet: bool = False, file: TextIO | None = None) -> Iterator[PhotosBar]:
+    """Show one bar on ``file`` (default stderr) for all ``stages`` from photos to a film."""
+    shares = {stage: _PHOTOS_SHARES[stage] for stage in stages}
+    with _StageBar("photos to film", shares, quiet=quiet, file=file) as bar:
+        is_terminal = (file or sys.stderr).isatty()
+        shown = PhotosBar(bar, _UPDATE_INTERVAL if is_terminal else _LOG_INTERVAL)
+        token = _outer.set(shown)
+        try:
+            yield shown
+        finally:
+            _outer.reset(token)
+
+
+class PhotosBar:
+    """Bar of all stages from photos to a film."""
+
+    def __init__(self, bar: _StageBar, interval: float) -> None:
+        self._bar, self._interval = bar, interval
+        self._stage, self._shown = "", 0.0
+
+    def update(self, stage: str, done: float = 0.0) -> None:
+        """Show that the fraction ``done`` of ``stage`` is finished."""
+        now = time.monotonic()
+        if stage != self._stage or now - self._shown > self._interval:
+            self._stage, self._shown = stage, now
+            self._bar.update(stage, done)
+
+    def skip(self, *stages: str) -> None:
+        """Do not count stages that finished in an earlier run."""
+        self._bar.skip(stages)
 
 
 @contextmanager
@@ -75,6 +119,10 @@ def scene_bar(
 @contextmanager
 def simulation_bar(*, quiet: bool = False, file: TextIO | None = None) -> Iterator[Callable[[int, int], None]]:
     """Show a bar on ``file`` (default stderr), and yield the ``progress`` argument of ``simulate``."""
+    outer = _outer.get()
+    if outer is not None:
+        yield lambda done, expected: outer.update("simulate", done / max(expected, 1))
+        return
     with (
         tqdm(desc="simulate", unit="frame", smoothing=_SMOOTHING, disable=quiet, file=file) as bar,
         _redrawn(bar.refresh, quiet=quiet, file=file),
@@ -83,6 +131,22 @@ def simulation_bar(*, quiet: bool = False, file: TextIO | None = None) -> Iterat
         def update(done: int, expected: int) -> None:
             bar.total = expected
             bar.update(done - bar.n)
+
+        yield update
+
+
+@contextmanager
+def render_bar(count: int, *, quiet: bool = False) -> Iterator[Callable[[], object]]:
+    """Show a bar on stderr for the ``count`` images of a film; call the yielded function after each of them."""
+    outer, done = _outer.get(), 0
+    with tqdm(total=count, desc="render", unit="frame", disable=quiet or outer is not None) as bar:
+
+        def update() -> None:
+            nonlocal done
+            done += 1
+            bar.update()
+            if outer is not None:
+                outer.update("render", done / count)
 
         yield update
 
@@ -127,10 +191,10 @@ class _StageBar:
 
     def __init__(self, name: str, shares: Mapping[str, float], *, quiet: bool, file: TextIO | None) -> None:
         self._name, self._shares = name, dict(shares)
-        self._starts = dict(zip(shares, accumulate(shares.values(), initial=0.0), strict=False))
-        self._total = sum(shares.values())
+        self.skip(())
         self._options: dict[str, Any] = {"bar_format": "{desc}", "disable": quiet, "file": file}
         self._is_quiet = quiet
+        self._outer = _outer.get()
         self._bar: Any = None
         self._stage, self._stage_start, self._done = "", 0.0, 0.0
         self._stack = ExitStack()
@@ -145,6 +209,10 @@ class _StageBar:
 
     def update(self, stage: str, done: float = 0.0) -> None:
         """Show that the fraction ``done`` of ``stage`` is finished."""
+        if self._outer is not None:
+            share, start = self._shares.get(stage, 0.0), self._starts.get(stage, self._total)
+            self._outer.update(self._name, (start + done * share) / self._total)
+            return
         if self._bar is None:
             self._bar = self._stack.enter_context(tqdm(**self._options))
             self._stack.push(self._show_end)
@@ -153,6 +221,12 @@ class _StageBar:
             self._stage, self._stage_start = stage, self._elapsed()
         self._done = done
         self._draw()
+
+    def skip(self, stages: Sequence[str]) -> None:
+        """Do not count ``stages``."""
+        self._shares = {stage: share for stage, share in self._shares.items() if stage not in stages}
+        self._starts = dict(zip(self._shares, accumulate(self._shares.values(), initial=0.0), strict=False))
+        self._total = sum(self._shares.values())
 
     def _show_end(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         if kind is None:

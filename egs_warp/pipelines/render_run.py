@@ -8,7 +8,6 @@ from enum import Enum
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.camera import Camera
@@ -18,6 +17,7 @@ from egs_warp.io.sequence import frame_paths
 from egs_warp.io.video import VideoWriter, write_png
 from egs_warp.pipelines.film import Frame, drawn_frames
 from egs_warp.pipelines.finished_run import FinishedRun
+from egs_warp.pipelines.progress import render_bar
 from egs_warp.pipelines.shot import Shot, around, nearest_steps, resized, turntable
 
 _MILLIMETRES = 1000.0
@@ -89,7 +89,7 @@ def render_run(
             width, height = cameras[0].width, cameras[0].height
             writer = VideoWriter(out, width, height, frames_per_second=shot.fps, alpha=shot.transparent)
             video = stack.enter_context(writer)
-        bar = stack.enter_context(tqdm(total=len(steps), desc="render", unit="frame", disable=quiet))
+        show_image = stack.enter_context(render_bar(len(steps), quiet=quiet))
         for index, frame in enumerate(frames):
             if video is not None:
                 video.write(_picture(frame, show, near, far))
@@ -97,7 +97,7 @@ def render_run(
                 write_png(pictures[index], _millimetres(frame))
             else:
                 write_png(pictures[index], _picture(frame, show, near, far))
-            bar.update()
+            show_image()
     return len(steps)
 
 

@@ -42,8 +42,7 @@ def segmentation_warnings(
         cameras: Views in which the object is tested.
     """
     warnings = []
-    touched = [_touched_edges(object_cloud, camera) for camera in cameras]
-    all_round, any_edge = sum(edges >= _ALL_ROUND for edges in touched), sum(edges > 0 for edges in touched)
+    all_round, any_edge = views_at_edges(object_cloud, cameras)
     if all_round:
         warnings.append(
             f"touches the picture's edges all round in {all_round} of {len(cameras)} views: its surroundings are"
@@ -65,6 +64,12 @@ def segmentation_warnings(
         percent = 100.0 * segmentation.object_mask.mean()
         warnings.append(f"has {percent:.0f} % of the capture's Gaussians; if this is more than the object, {_REMEDY}")
     return warnings
+
+
+def views_at_edges(object_cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[int, int]:
+    """Return the number of ``cameras`` in whose pictures the object touches the edges all round, and any edge."""
+    touched = [_touched_edges(object_cloud, camera) for camera in cameras]
+    return sum(edges >= _ALL_ROUND for edges in touched), sum(edges > 0 for edges in touched)
 
 
 def _touched_edges(object_cloud: GaussianCloud, camera: Camera) -> int:

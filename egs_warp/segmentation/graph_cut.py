@@ -8,7 +8,7 @@ docs/concepts/segmentation.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -81,6 +81,12 @@ class SplatGraph:
         away, apart = _differences(points, colours, first, second)
         strength = np.bincount(link, weights=self.strength[between], minlength=len(codes))
         return SplatGraph(count, first, second, away * (1.0 + _DETOUR * apart), strength)
+
+    def where(self, chosen: np.ndarray) -> SplatGraph:
+        """Return the graph with only the ``chosen`` (m,) bool links."""
+        return replace(
+            self, **{name: getattr(self, name)[chosen] for name in ("first", "second", "length", "strength")}
+        )
 
     def among(self, chosen: np.ndarray) -> SplatGraph:
         """Return the links between the ``chosen`` (n,) bool Gaussians, which are numbered in their order."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.height_field import HeightField
@@ -24,6 +25,10 @@ _MIN_OPACITY = 0.1
 """Minimum opacity of Gaussians that link others. Fainter ones follow the nearest opaque one."""
 _NEIGHBOURS = 6
 """Number of nearest neighbours to which a Gaussian is linked."""
+_SIGMAS, _MAX_GAP = 3.0, 2.0
+"""Half-length of a Gaussian in standard deviations, and the longest gap between two linked Gaussians, in medians of the
+distances between neighbours. Without this limit, a floater in empty space is linked to the object alone, so that no cut
+is cheaper than to include it."""
 _CLUSTER = 12
 """Maximum number of Gaussians in a cluster."""
 _COLOUR_SPLITS = 2
@@ -73,14 +78,19 @@ class ClickGraph:
             opaque[:] = True
         points = means[opaque]
         colours = cloud.sh.numpy()[opaque, 0].astype(np.float64) * SH_BAND_0 + 0.5
+        links = SplatGraph.linking(points, colours, neighbours=_NEIGHBOURS)
+        links = links.where(_gaps(cloud, np.flatnonzero(opaque), links) < _MAX_GAP)
         own = _clusters(points, np.clip(colours, 0.0, 1.0))
+        # A cluster is a box, which may hold a part of the object and a floater far from it.
+        parts = links.parts(np.ones(len(own), bool)).astype(np.int64)
+        own = np.unique(own * len(own) + parts, return_inverse=True)[1].astype(np.int32)
         count = int(own.max()) + 1
         middles, shades = (
             np.stack([np.bincount(own, weights=column, minlength=count) for column in values.T], axis=1)
             / np.bincount(own, minlength=count)[:, None]
             for values in (points, colours)
         )
-        links = SplatGraph.linking(points, colours, neighbours=_NEIGHBOURS).clustered(own, middles, shades)
+        links = links.clustered(own, middles, shades)
         cluster = np.empty(len(means), np.int32)
         cluster[opaque] = own
         if not opaque.all():
@@ -257,6 +267,22 @@ def _without(links: SplatGraph, seeds: np.ndarray, removed: np.ndarray) -> np.nd
     included[seeds], excluded[removed] = True, True
     mean = 2.0 * links.strength.sum() / max(links.count, 1)
     return links.cut(score, included, excluded, smoothness=1.0 / max(mean, 1e-12))
+
+
+def _gaps(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph) -> np.ndarray:
+    """(m,) length of the empty part of each link between the Gaussians ``nodes`` (k,), divided by the median length of
+    all links; negative if the two Gaussians overlap."""
+    points = cloud.means.numpy()[nodes].astype(np.float64)
+    arms = points[links.second] - points[links.first]
+    lengths = np.linalg.norm(arms, axis=1)
+    along = arms / np.maximum(lengths, 1e-30)[:, None]
+    rotations = Rotation.from_quat(cloud.rotations.numpy()[nodes], scalar_first=True)
+    scales = np.exp(cloud.log_scales.numpy()[nodes].astype(np.float64))
+    extents = (
+        np.linalg.norm(scales[ends] * rotations[ends].apply(along, inverse=True), axis=1)
+        for ends in (links.first, links.second)
+    )
+    return (lengths - _SIGMAS * sum(extents)) / max(float(np.median(lengths)), 1e-30) if len(lengths) else lengths
 
 
 def _clusters(points: np.ndarray, colours: np.ndarray) -> np.ndarray:

@@ -18,16 +18,19 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.picked import PickedFile, PickedObject, write_picked
 from egs_warp.io.planes import PlaneRecord
 from egs_warp.motions.repertoire import MOTIONS
-from egs_warp.pipelines.info import inspect_capture
+from egs_warp.pipelines.info import BodyInfo, inspect_capture
 from egs_warp.pipelines.pick import (
     Pick,
     PickHistory,
     PickState,
+    edge_warnings,
+    ground_around,
     marked,
     on_table_top,
     pick_warnings,
@@ -35,6 +38,7 @@ from egs_warp.pipelines.pick import (
     resegmented,
     stroke_at,
 )
+from egs_warp.segmentation.ground import REACH
 from egs_warp.segmentation.interactive import ClickGraph
 from egs_warp.web.pick_jobs import Job
 from egs_warp.web.pick_messages import (
@@ -57,6 +61,9 @@ _MEASURE_DELAY = 0.8
 """Time without messages after which the active object is measured, s."""
 _NO_BODY: dict[str, Any] = {"type": "body", "rows": [], "motions": [], "front": None}
 """Event of an object without measurements."""
+_GRID_REACH, _GRID_STEP = 1.2, 2
+"""Half the side of the ground's grid for the page, in sizes of the object, and the number of measured nodes from one
+node of that grid to the next."""
 _MEASURE_NODES = 120
 """Approximate number of cage nodes with which it is measured; feet and motions hardly depend on it."""
 
@@ -95,6 +102,10 @@ class PickSource:
     """Returns the objects to begin with, in the frame of the capture: of a file, or of the command line."""
     centre: np.ndarray | None = None
     """(3,) point at which the cameras look, in the frame of the page."""
+    cameras: Sequence[Camera] = ()
+    """Cameras of the capture, in its own frame; empty if they are not known."""
+    film: str | None = None
+    """Motion of the film that is made after the page; None if the page starts ``commands``."""
 
 
 class PickSession:
@@ -115,6 +126,8 @@ class PickSession:
         self._is_stopping, self._unmeasured = False, threading.Event()
         self._busy = "preparing the capture"
         self._jobs: dict[str, Job] = {}
+        self.has_film_request = threading.Event()
+        """Set when the file is written and the film of ``PickSource.film`` is to be made."""
         self._thread = threading.Thread(target=self._run_loop, name="pick", daemon=True)
         self._measuring = threading.Thread(target=self._measure_loop, name="pick measurements", daemon=True)
 
@@ -276,6 +289,7 @@ class PickSession:
     def _show(self) -> None:
         """Send the current state to the page, and measure the active object later."""
         self._events.pop("body", None)
+        self._events.pop("ground", None)
         self._unmeasured.set()
         labels = base64.b64encode(self.state.labels().tobytes()).decode()
         self._send({"type": "labels", "data": labels})
@@ -328,24 +342,62 @@ class PickSession:
             # Measurements of an earlier selection are out of date.
             if self.state.pick is pick:
                 self._send(event)
+                grid = self.ground_grid(pick)
+                if self.state.pick is pick:
+                    self._send({"type": "ground", "grid": grid})
 
     def _body_event(self, pick: Pick) -> dict[str, Any]:
         """Return the event ``body``: size, support, front and possible motions of an object."""
         if not pick.mask.any():
             return _NO_BODY
         placed = self.source.placed
+        warnings = edge_warnings(self.source.cloud, pick.mask, self.source.cameras)
         above = pick.mask & (pick.plane.heights(placed.means.numpy()) > 0.0)
+        if not above.any():
+            return _NO_BODY
         try:
             info = inspect_capture(placed.subset(above), plane=pick.plane, front=pick.front, nodes=_MEASURE_NODES)
         except UserError as error:
-            return {**_NO_BODY, "rows": [["problem", str(error)]]}
+            return {**_NO_BODY, "rows": [["problem", text] for text in (*warnings, str(error))]}
         height = info.body.height / info.standing.frame.scale / self.source.frame.scale
         return {
             **_NO_BODY,
-            "rows": [["height", f"{height:.3g} units of the capture"], ["stands on", info.stands()]],
-            "motions": [{"name": n, "why": w} for n, w in info.motions().items() if MOTIONS[n].file is None],
+            "rows": [
+                *(["problem", text] for text in warnings),
+                ["height", f"{height:.3g} units of the capture"],
+                ["stands on", info.stands()],
+            ],
+            "motions": self._motions(info),
             "front": (info.standing.frame.axes.T @ info.front.direction).tolist(),
         }
+
+    def ground_grid(self, pick: Pick) -> dict[str, Any] | None:
+        """Return the uneven ground about an object in the frame of the page, with the heights of nodes row by row; None
+        if it is flat or there is no ground to measure."""
+        source, frame = self.source, self.source.frame
+        ground = ground_around(source.cloud, pick.mask, plane_in_capture(pick.plane, frame), source.cameras)
+        if ground is None:
+            return None
+        nodes = ground.nodes()
+        middle = len(nodes) // 2
+        reach = round(_GRID_REACH / REACH * middle)
+        rows = np.arange(middle - reach, middle + reach + 1, _GRID_STEP)
+        heights = ground.plane.heights(nodes[rows][:, rows]) * frame.scale
+        first = ground.origin + ground.spacing * rows[0] * (ground.axes[0] + ground.axes[1])
+        return {
+            "origin": frame.points(first).tolist(),
+            "first": (frame.axes @ ground.axes[0]).tolist(),
+            "second": (frame.axes @ ground.axes[1]).tolist(),
+            "spacing": _GRID_STEP * ground.spacing * frame.scale,
+            "count": len(rows),
+            "heights": np.round(heights, 5).ravel().tolist(),
+        }
+
+    def _motions(self, info: BodyInfo) -> list[dict[str, str | None]]:
+        """Return the motions that the page offers, and those that the object cannot do with the reason."""
+        if self.source.film is not None:
+            return [{"name": self.source.film, "why": None}]
+        return [{"name": n, "why": w} for n, w in info.motions().items() if MOTIONS[n].file is None]
 
     # Called from the thread of the session.
 
@@ -380,6 +432,12 @@ class PickSession:
         pick = self.state.pick
         if not pick.mask.any():
             raise UserError("nothing is selected; click on the object first")
+        if kind == "animate" and self.source.film is not None:
+            self.save()
+            text = "is made in the terminal; this page can be closed"
+            self._send({"type": "animate", "text": text, "running": False, "failed": False})
+            self.has_film_request.set()
+            return
         running = self._jobs.get(kind)
         if running is not None and running.is_running:
             if kind == "animate":

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from egs_warp.cli import main
+from egs_warp.commands.train import TrainStep
 from tests.support.posed import posed_folder
 
 pytest.importorskip("torch")
@@ -43,8 +44,8 @@ def test_ctrl_c_prints_how_to_continue(
     assert main(line(posed, whole)) == 0
     with monkeypatch.context() as patch:
 
-        def stop(self: object, step: int, loss: float) -> None:
-            if step == 150:
+        def stop(self: object, step: TrainStep) -> None:
+            if step.done == 151:
                 raise KeyboardInterrupt
 
         patch.setattr("egs_warp.commands.train._Progress.step", stop)

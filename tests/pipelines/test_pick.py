@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import concatenate
 from egs_warp.geometry.plane import Plane
 from egs_warp.pipelines.pick import (
@@ -14,6 +15,7 @@ from egs_warp.pipelines.pick import (
     Pick,
     PickHistory,
     PickState,
+    edge_warnings,
     marked,
     on_table_top,
     pick_warnings,
@@ -130,4 +132,19 @@ def test_warnings_name_a_remedy(apart: ClickGraph):
     low = replace(ball, plane=Plane(UP, 1.0))
     (line,) = pick_warnings(apart, low)
     assert line.startswith("it hangs 0.5") and line.endswith("drag the ground to its feet")
+    high = replace(ball, plane=Plane(UP, -5.0))
+    below = "nothing of it is above the ground; drag the ground down, or click on the object"
+    assert pick_warnings(apart, high) == (below,)
     assert pick_warnings(apart, empty(apart)) == () and size_of(apart, empty(apart)) == 0.0
+
+
+def test_surroundings_that_came_along_are_reported(apart: ClickGraph):
+    """The left ball is whole in all pictures; the floor and both balls fill a close picture."""
+    close = Camera.look_at(
+        np.array([0.0, -1.5, 2.5]), np.zeros(3), UP, width=400, height=300, vertical_fov_degrees=50.0
+    )
+    ball = np.arange(apart.cloud.count) < EACH
+    assert edge_warnings(apart.cloud, ball, [front()]) == () == edge_warnings(apart.cloud, ball, [])
+    (line,) = edge_warnings(apart.cloud, np.ones(apart.cloud.count, bool), [front(), close])
+    assert line.startswith("it touches the picture's edges all round in ") and " of 2 photos, " in line
+    assert line.endswith("; remove what does not belong to it")

@@ -9,7 +9,15 @@ from functools import partial
 import pytest
 
 from egs_warp.pipelines.prepare_scene import SceneOptions
-from egs_warp.pipelines.progress import conversion_bar, info_bar, preparation_bar, scene_bar, simulation_bar
+from egs_warp.pipelines.progress import (
+    conversion_bar,
+    info_bar,
+    photos_bar,
+    preparation_bar,
+    render_bar,
+    scene_bar,
+    simulation_bar,
+)
 from egs_warp.segmentation.clearance import StraddlingPolicy
 
 
@@ -111,3 +119,38 @@ def test_a_quiet_bar_writes_nothing() -> None:
     with pytest.raises(KeyboardInterrupt), preparation_bar(file=file):
         raise KeyboardInterrupt
     assert file.getvalue() == ""
+
+
+def test_all_stages_from_photos_to_a_film_share_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = [1000.0]
+    monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
+    file, lines = io.StringIO(), []
+
+    def shown() -> None:
+        lines.append(file.getvalue().split("\r")[-1].strip())
+
+    with photos_bar(["pose", "train", "scene", "prepare", "simulate", "render"], file=file) as bar:
+        bar.update("pose")
+        bar.skip("pose")
+        bar.update("train")
+        clock[0] += 100.0
+        with scene_bar({"plane": True, "segment": True}) as progress:
+            progress("plane", 0.0)
+            shown()
+            progress("segment", 0.0)
+        with preparation_bar() as begin_stage:
+            begin_stage("stand")
+            begin_stage("balance")
+        with simulation_bar() as progress:
+            progress(1, 2)
+            shown()
+        with render_bar(2) as show_image:
+            show_image()
+            shown()
+    # The training took 100 s, so that the scene, of 3/10 of its share, takes 30 s; the rest takes 28 s.
+    assert [line.split(",")[0] for line in lines] == [f"photos to film: {s}" for s in ("scene", "simulate", "render")]
+    assert lines[0].endswith(", 01:40<00:58")
+    assert file.getvalue().split("\r")[-1].startswith("photos to film: done, 01:40")
+    assert capsys.readouterr().err == ""

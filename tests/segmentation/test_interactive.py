@@ -112,3 +112,17 @@ def test_three_hundred_thousand_gaussians_take_less_than_two_seconds_for_each_cl
     chosen = segment_by_clicks(graph, [hit], FLOOR)
     assert time.process_time() - started < 2.0
     assert chosen[: len(skin)].mean() > 0.95
+
+
+def test_floaters_far_from_an_object_do_not_belong_to_it():
+    """Their nearest neighbours are those of the ball, from which empty space separates them."""
+    random = np.random.default_rng(0)
+    floaters = random.uniform((-0.9, -0.4, 1.3), (-0.1, 0.4, 1.8), (8, 3))
+    beside = np.array([[0.5, 1.6, 0.4], [0.5, -1.6, 0.4]])
+    scene = balls((-0.6, 0.9))
+    cloud = concatenate(scene, round_ones(np.concatenate([floaters, beside]), 0.02))
+    graph = ClickGraph.of(cloud)
+    for point, ball in ((LEFT, 0), (RIGHT, 1)):
+        chosen = segment_by_clicks(graph, [click(cloud, point)], FLOOR)
+        assert shares(chosen[: scene.count])[ball] > 0.85
+        assert not chosen[scene.count :].any()

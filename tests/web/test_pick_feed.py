@@ -160,6 +160,21 @@ def test_the_ground_and_the_front_are_dragged(chromium: Any, tmp_path: Path):
         changed(page, lambda: page.click("#undo"))
         changed(page, lambda: page.click("#undo"))
         assert session.state.pick.plane is before.plane
+        # Uneven ground moves with its plane, and is that of one object.
+        assert page.evaluate(
+            """() => {
+                const { gizmos, state } = egs.pick, [x, y, z, d] = state.plane;
+                const axes = { first: [1, 0, 0], second: [0, 1, 0] };
+                const grid = { ...axes, spacing: 18, count: 2, heights: [0.1, 0.1, 0.1, 0.1] };
+                gizmos.showGround({ origin: [-9, -9, 0], ...grid });
+                gizmos.show({ ...state, plane: [x, y, z, d - 0.2] });
+                const isShown = gizmos.ground !== null;
+                gizmos.show({ ...state, active: state.active + 1 });
+                const isOther = gizmos.ground !== null;
+                gizmos.show(state);
+                return [isShown, isOther];
+            }"""
+        ) == [True, False]
         left = (session.source.frame.axes @ np.array([-1.0, 0.0, 0.0])).tolist()
         changed(page, lambda: page.evaluate(f"egs.viewers[0].source.send({{type: 'front', direction: {left}}})"))
         changed(page, lambda: drag("front", 10, 25))

@@ -5,13 +5,16 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.plane import Plane
 from egs_warp.io.picked import read_picked
+from egs_warp.pipelines.pick import Pick
 from egs_warp.web.pick_messages import (
     AddObject,
     Mark,
@@ -26,7 +29,9 @@ from egs_warp.web.pick_messages import (
 )
 from egs_warp.web.pick_session import PickSession
 from tests.support.clicking import balls
+from tests.support.grounds import on_folds
 from tests.support.picking import events_until, picking
+from tests.support.waves import wave
 
 EACH = 1500
 
@@ -140,3 +145,42 @@ def test_the_thread_sends_labels_state_and_measurements(tmp_path: Path):
         json.dumps(again)
     finally:
         session.stop()
+
+
+def test_before_a_film_the_page_offers_its_motion_and_ends(tmp_path: Path):
+    session, _ = picking(balls((-0.6, 0.9), between=1.6), tmp_path / "picked.json")
+    session.source = replace(session.source, film="hop x2")
+    session.prepare()
+    session.apply(mark(session, 0))
+    assert session._body_event(session.state.pick)["motions"] == [{"name": "hop x2", "why": None}]
+    assert not session.has_film_request.is_set()
+    session.apply(RunAnimate("hop x2"))
+    assert session.has_film_request.is_set()
+    assert read_picked(tmp_path / "picked.json", session.source.cloud).objects[0].gaussians[:EACH].mean() > 0.9
+    event = next(one for one in session.take_events() if one["type"] == "animate")
+    assert event["text"] == "is made in the terminal; this page can be closed" and not event["running"]
+
+
+@pytest.mark.slow
+def test_the_page_gets_the_heights_of_uneven_ground(tmp_path: Path):
+    """A ball on folds of 4 % of its height; the heights of the grid are those of the folds to 1 %."""
+    cloud, is_ball = on_folds(0.04, length=0.9)
+    session, _ = picking(cloud, tmp_path / "picked.json")
+    frame = session.source.frame
+    # The heights are over the plane, wherever the user has put it.
+    plane = frame.plane(Plane(np.array([0.0, 0.0, 1.0]), -0.1))
+    grid = session.ground_grid(Pick("ball", plane, is_ball))
+    assert grid is not None and len(grid["heights"]) == grid["count"] ** 2
+    columns, rows = np.meshgrid(*2 * [grid["spacing"] * np.arange(grid["count"])])
+    flat = np.array(grid["origin"]) + columns[..., None] * grid["first"] + rows[..., None] * grid["second"]
+    points = flat + np.reshape(grid["heights"], columns.shape)[..., None] * plane.normal
+    captured = points.reshape(-1, 3) / frame.scale @ frame.axes + frame.origin
+    seen = np.linalg.norm(captured[:, :2], axis=1) > 0.4
+    np.testing.assert_allclose(captured[seen, 2], wave(captured[seen, :2], 0.04, 0.9), atol=0.01)
+    assert session.ground_grid(Pick("all", plane, np.ones(cloud.count, bool))) is None
+
+
+@pytest.mark.slow
+def test_flat_ground_has_no_heights(shared: PickSession):
+    mask = np.arange(shared.source.cloud.count) < EACH
+    assert shared.ground_grid(replace(shared.state.pick, mask=mask)) is None

@@ -165,6 +165,9 @@ export class Pick {
       if (this.state?.front == null) this.gizmos.showFront(news.front);
       this.panel.showBody(news);
       this.viewer.invalidate();
+    } else if (news.type === "ground") {
+      this.gizmos.showGround(news.grid);
+      this.viewer.invalidate();
     } else if (news.type === "animate" || news.type === "live") {
       this.jobs.set(news.type, news);
       this.panel.showJob(news);

@@ -1,7 +1,7 @@
 // Ground grid, up and front arrows of the picked object, and the handles by which they are dragged.
 
 import * as THREE from "three";
-import type { PickState, Vector } from "./pick_news";
+import type { GroundGrid, PickState, Vector } from "./pick_news";
 import { WideLines } from "./wide_lines";
 
 export type Handle = "up" | "front" | "ground";
@@ -15,6 +15,8 @@ const COLOURS: Record<Handle, Vector> = {
 /** Lengths in sizes of the object. */
 const GRID_HALF = 0.8;
 const GRID_LINES = 9;
+/** Segments of a line of the grid on uneven ground. */
+const GRID_SEGMENTS = 32;
 const REACH: Record<Handle, number> = { up: 0.95, front: 0.85, ground: 0.9 };
 /** Half of a handle's cross, relative to the size of the object. */
 const MARK_SIZE = 0.03;
@@ -26,6 +28,9 @@ export class PickGizmos {
   readonly anchor = new THREE.Vector3();
   readonly front = new THREE.Vector3(1, 0, 0);
   size = 1;
+  /** Uneven ground, which moves with the plane; null if it is flat or not measured. */
+  ground: GroundGrid | null = null;
+  private active = 0;
   private hasFront = false;
   private readonly grid = new WideLines(1.5, 0.55, 10, { hasRim: false });
   private readonly arrows = new WideLines(4, 1, 12);
@@ -40,11 +45,37 @@ export class PickGizmos {
   }
 
   show(state: PickState): void {
-    this.normal.set(state.plane[0], state.plane[1], state.plane[2]);
+    const normal = new THREE.Vector3(state.plane[0], state.plane[1], state.plane[2]);
+    // The heights of another object, or over another plane, do not apply.
+    if (state.active !== this.active || normal.distanceTo(this.normal) > 1e-6) this.ground = null;
+    this.active = state.active;
+    this.normal.copy(normal);
     this.anchor.set(...state.anchor);
     this.size = state.size;
     if (state.front !== null) this.showFront(state.front);
     this.draw();
+  }
+
+  /** Show the measured ground; null if it is flat. */
+  showGround(ground: GroundGrid | null): void {
+    this.ground = ground;
+    this.draw();
+  }
+
+  /** Return the height of the ground over its plane at `point`, between the nodes bilinearly. */
+  private heightAt(point: THREE.Vector3): number {
+    const { ground } = this;
+    if (ground === null) return 0;
+    const arm = point.clone().sub(new THREE.Vector3(...ground.origin));
+    const last = ground.count - 1;
+    const [x, y] = [ground.first, ground.second].map((axis) =>
+      Math.min(Math.max(arm.dot(new THREE.Vector3(...axis)) / ground.spacing, 0), last),
+    ) as [number, number];
+    const [column, row] = [Math.min(Math.floor(x), last - 1), Math.min(Math.floor(y), last - 1)];
+    const at = (r: number, c: number): number => ground.heights[r * ground.count + c] ?? 0;
+    const [s, t] = [x - column, y - row];
+    const near = (1 - s) * at(row, column) + s * at(row, column + 1);
+    return (1 - t) * near + t * ((1 - s) * at(row + 1, column) + s * at(row + 1, column + 1));
   }
 
   /** Show the given or estimated front; null if there is none yet. */
@@ -107,12 +138,18 @@ export class PickGizmos {
     const side = ahead.clone().cross(normal);
     const half = GRID_HALF * size;
     const lines: number[] = [];
-    const point = (x: number, y: number): THREE.Vector3 =>
-      anchor.clone().addScaledVector(ahead, x).addScaledVector(side, y);
+    const point = (x: number, y: number): THREE.Vector3 => {
+      const flat = anchor.clone().addScaledVector(ahead, x).addScaledVector(side, y);
+      return flat.addScaledVector(normal, this.heightAt(flat));
+    };
+    const segments = this.ground === null ? 1 : GRID_SEGMENTS;
     for (let k = 0; k < GRID_LINES; k++) {
       const at = half * ((2 * k) / (GRID_LINES - 1) - 1);
-      lines.push(...point(at, -half).toArray(), ...point(at, half).toArray());
-      lines.push(...point(-half, at).toArray(), ...point(half, at).toArray());
+      for (let n = 0; n < segments; n++) {
+        const [begin, end] = [n, n + 1].map((m) => half * ((2 * m) / segments - 1)) as [number, number];
+        lines.push(...point(at, begin).toArray(), ...point(at, end).toArray());
+        lines.push(...point(begin, at).toArray(), ...point(end, at).toArray());
+      }
     }
     this.grid.set(lines, lines.map((_, k) => COLOURS.ground[k % 3]!));
     const arrows: number[] = [];

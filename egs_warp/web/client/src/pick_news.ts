@@ -33,6 +33,19 @@ export interface BodyNews {
   front: Vector | null;
 }
 
+/** Uneven ground about the active object: heights over the plane at the nodes of a square grid, row by row. */
+export interface GroundGrid {
+  /** First node, on the plane. */
+  origin: Vector;
+  /** Unit vectors along the rows and along the columns. */
+  first: Vector;
+  second: Vector;
+  spacing: number;
+  /** Number of columns, and of rows. */
+  count: number;
+  heights: number[];
+}
+
 /** Progress of a command that the page has started; it may serve a page of its own. */
 export interface JobNews {
   type: "animate" | "live";
@@ -46,5 +59,6 @@ export type PickNews =
   | PickState
   | BodyNews
   | JobNews
+  | { type: "ground"; grid: GroundGrid | null }
   | { type: "labels"; data: string }
   | { type: "work"; text: string };
