@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from egs_warp.geometry.camera import Camera
     from egs_warp.geometry.gaussians import GaussianCloud, concatenate
     from egs_warp.geometry.height_field import HeightField
+    from egs_warp.geometry.main_light import MainLight
     from egs_warp.geometry.plane import Plane
     from egs_warp.geometry.tetmesh import TetMesh
     from egs_warp.inpainting.holes import footprint
@@ -77,6 +78,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "geometry.camera": ("Camera",),
     "geometry.gaussians": ("GaussianCloud", "concatenate"),
     "geometry.height_field": ("HeightField",),
+    "geometry.main_light": ("MainLight",),
     "geometry.plane": ("Plane",),
     "geometry.tetmesh": ("TetMesh",),
     "inpainting.holes": ("footprint",),
@@ -151,6 +153,7 @@ __all__ = [
     "Key",
     "LearningRates",
     "LocomotionSettings",
+    "MainLight",
     "MaskedView",
     "ObjectSpec",
     "Plane",

@@ -236,7 +236,7 @@ def test_choices_of_flags_are_those_of_the_library() -> None:
         (action,) = [action for action in _parsers()[1][command]._actions if flag in action.option_strings]
         return set(action.choices or ())
 
-    assert choices("convert", "--to") == set(WRITERS) == choices("export", "--to") - {"usd", "bundle"}
+    assert choices("convert", "--to") == set(WRITERS) == choices("export", "--to") - {"usd", "bundle", "skin"}
     assert choices("animate", "--qp") == choices("live", "--qp") == {solver.value for solver in QpSolver}
     assert choices("animate", "--strategy") == choices("live", "--strategy") == {each.value for each in Strategy}
     assert choices("render", "--show") == {show.value for show in Show}

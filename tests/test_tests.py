@@ -20,6 +20,7 @@ ACROSS = {
     "motions/test_runs.py",
     "pipelines/test_invariance.py",
     "pipelines/test_python_api.py",
+    "web/test_headset.py",
     "web/test_live_page.py",
     "web/test_steered.py",
 }

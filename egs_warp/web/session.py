@@ -27,6 +27,7 @@ from egs_warp.web.frame_encoding import encode_frame
 from egs_warp.web.idle import StillnessDetector, tilt_degrees
 from egs_warp.web.mailbox import Mailbox, News
 from egs_warp.web.messages import (
+    STYLE_NAMES,
     Cancel,
     Change,
     GoTo,
@@ -311,7 +312,7 @@ class Session:
             "pulled": self._user_forces.is_pulling,
             "friction": self.friction,
             "sag": self.sag,
-            "style": vars(steering.style),
+            "style": {name: getattr(steering.style, name) for name in STYLE_NAMES},
             "motions": len(steering.records),
             "step": self._dt,
         }

@@ -15,6 +15,7 @@ from egs_warp.motions.script import motion
 from egs_warp.motions.stance import sole_shares
 from egs_warp.motions.style import PRESETS, Style
 from egs_warp.pipelines.creature import initial_stance
+from egs_warp.web.messages import STYLE_NAMES
 from egs_warp.web.steering import ARRIVAL_DISTANCE, MAX_HEADING_ERROR, MotionScheduler, PointNavigation
 from tests.support.creatures import coarse_creature
 from tests.support.live_sessions import SteppedSession, coarse_pawn
@@ -74,9 +75,11 @@ def test_a_style_applies_to_later_motions(tmp_path: Path):
     played.step()
     usual = session.steering._active.motion
     assert isinstance(usual, Jump)
-    played.request("style", **PRESETS["heavy"])
+    # The page sends the factors alone: a session keeps the overlap of its body.
+    factors = {name: PRESETS["heavy"][name] for name in STYLE_NAMES}
+    played.request("style", **factors)
     played.step()
-    assert session.steering._active.motion is usual and session.state_message()["style"] == PRESETS["heavy"]
+    assert session.steering._active.motion is usual and session.state_message()["style"] == factors
     played.request("stand")
     played.request("set", friction=0.5)
     played.request("motion", text="jump 0 0.1, walk 0.1")
@@ -86,7 +89,7 @@ def test_a_style_applies_to_later_motions(tmp_path: Path):
     assert heavy.plan.crouch_depth == pytest.approx(1.3 * usual.plan.crouch_depth, rel=0.3)
     assert heavy.plan.crouch_time > 1.4 * usual.plan.crouch_time
     assert heavy.plan.landing_rate == pytest.approx(usual.plan.landing_rate / 1.4)
-    assert [request.style for request in session.steering.requests] == [None, Style(**PRESETS["heavy"])]
+    assert [request.style for request in session.steering.requests] == [None, Style(**factors)]
 
 
 def test_a_motion_that_the_body_cannot_do_is_reported(tmp_path: Path):
