@@ -105,7 +105,7 @@ def measure(creature: Creature, jump: np.ndarray, worlds: int, *, alone: int, pa
         state, done, failed = stepper.advance(state, row, dt)
         if bool(failed.any()):
             raise RuntimeError(f"{int(failed.sum())} worlds of {worlds} could not be solved in step {number}")
-        halved += worlds - int(done[0].report.converged.sum()) if done[0].report.dt == dt else worlds
+        halved += worlds - int(torch.as_tensor(done[0].report.converged).sum()) if done[0].report.dt == dt else worlds
     seconds = watch.now() - started
     result = {
         "nodes": len(creature.body.mesh.nodes),

@@ -148,7 +148,8 @@ def _is_conflict(best: _Candidate, by_ground: _Candidate, by_shading: _Candidate
     angle = np.degrees(np.arccos(np.clip(by_ground.direction @ by_shading.direction, -1.0, 1.0)))
     is_apart = best.evidence < _WEAK and angle > _MAX_ANGLE and min(by_ground.ground, by_shading.shading) > _MIN_ALONE
     reached = min(best.ground, 1.0) + min(best.shading, 1.0)
-    return is_apart or reached < _MIN_AGREEMENT * (min(by_ground.ground, 1.0) + min(by_shading.shading, 1.0))
+    alone = min(by_ground.ground, 1.0) + min(by_shading.shading, 1.0)
+    return bool(is_apart) or reached < _MIN_AGREEMENT * alone
 
 
 def _azimuth_between(first: _Candidate, second: _Candidate) -> float:

@@ -48,7 +48,7 @@ def without_shadow(
     weights = np.linalg.lstsq(evidence.causes[lit], evidence.log_brightness[lit], rcond=1e-6)[0]
     darker = evidence.causes @ weights - evidence.log_brightness
     tree = KDTree(evidence.points)
-    near = tree.query(evidence.points, k=min(_SMOOTH, len(evidence.points)))[1]
+    near = np.asarray(tree.query(evidence.points, k=min(_SMOOTH, len(evidence.points)))[1])
     depth = -DISPLAY_GAMMA * np.log1p(-light.shade)
     excess = np.clip(darker[near].mean(axis=1), 0.0, depth * shadow)
     means = background.means.numpy().astype(np.float64)
@@ -56,7 +56,7 @@ def without_shadow(
     distance, cell = tree.query(means[on_ground], distance_upper_bound=2.0 * evidence.cell)
     found = np.isfinite(distance)
     rows = on_ground[found]
-    gain = np.exp(excess[cell[found]] / DISPLAY_GAMMA)[:, None]
+    gain = np.exp(excess[np.asarray(cell)[found]] / DISPLAY_GAMMA)[:, None]
     sh = background.sh.numpy().copy()
     sh[rows] *= gain[:, None]
     sh[rows, 0] += 0.5 * (gain - 1.0) / SH_BAND_0

@@ -30,7 +30,7 @@ def surface_normals(cloud: GaussianCloud) -> np.ndarray:
         return np.zeros_like(means)
     points = means[chosen]
     tree = KDTree(points)
-    _, near = tree.query(points, k=min(_FAR, len(points)))
+    near = np.asarray(tree.query(points, k=min(_FAR, len(points)))[1])
     piece = points[near[:, :_NEAR]]
     piece = piece - piece.mean(axis=1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", piece, piece))[1][:, :, 0]

@@ -276,10 +276,12 @@ def _gaps(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph) -> np.ndar
     arms = points[links.second] - points[links.first]
     lengths = np.linalg.norm(arms, axis=1)
     along = arms / np.maximum(lengths, 1e-30)[:, None]
-    rotations = Rotation.from_quat(cloud.rotations.numpy()[nodes], scalar_first=True)
+    quaternions = cloud.rotations.numpy()[nodes]
     scales = np.exp(cloud.log_scales.numpy()[nodes].astype(np.float64))
     extents = (
-        np.linalg.norm(scales[ends] * rotations[ends].apply(along, inverse=True), axis=1)
+        np.linalg.norm(
+            scales[ends] * Rotation.from_quat(quaternions[ends], scalar_first=True).apply(along, inverse=True), axis=1
+        )
         for ends in (links.first, links.second)
     )
     return (lengths - _SIGMAS * sum(extents)) / max(float(np.median(lengths)), 1e-30) if len(lengths) else lengths
