@@ -204,7 +204,7 @@ class _Run:
             yield None
             return
         if state is StageState.OTHER:
-            print_note(f"{stage}: its input, its flags or its files have changed; it is made again")
+            print_note(f"{stage}: its input, its flags or its files have changed; the stage runs again")
         self._record.begin(stage, key)
         yield state
         self._record.finish(stage, key, files())
@@ -276,9 +276,9 @@ class _Run:
             if args.yes and not picked.is_file():
                 pick_automatically(pick)
             elif args.yes:
-                print_note(f"the object is that of {picked}")
+                print_note(f"using the object of {picked}")
             elif not pick_on_page(pick, film=args.motion):
-                raise UserError(f"{picked}: the page has ended before Animate was pressed; repeat the command")
+                raise UserError(f"{picked}: the page ended before Animate was pressed; repeat the command")
 
     def _film(self, capture: Path, posed: Path | None) -> int:
         from egs_warp.commands.animate import run_animate

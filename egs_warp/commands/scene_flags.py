@@ -76,7 +76,7 @@ def start_device(device: str) -> None:
 
     use_device(device)
     if not kernels_are_compiled():
-        print_note("the first run on this machine compiles the kernels, once")
+        print_note("the first run on this machine compiles the kernels, which takes a minute or two")
 
 
 def print_note(text: str) -> None:

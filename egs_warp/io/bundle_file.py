@@ -96,7 +96,7 @@ def _read(data: bytes) -> tuple[BundleFile | None, list[str]]:
     # In the order of the file, in which a player receives them.
     for place, entry in sorted(_entries(text), key=lambda item: item[1]["offset"]):
         if entry["offset"] < end:
-            problems.append(f"{place}: its bytes overlap with those of another array")
+            problems.append(f"{place}: its bytes overlap another array")
         end = entry["offset"] + entry["bytes"]
         try:
             stored[place] = PackedArray.from_file(entry, payload[entry["offset"] : end].tobytes())

@@ -38,7 +38,7 @@ def conversion_loss(
         rest = "; colours no longer change with the view" if new.sh_degree == 0 else ""
         lines.append(f"colours of degree {old.sh_degree} are now of degree {new.sh_degree}{rest}")
     if before.antialiased and not after.antialiased:
-        lines.append("the mark of training with antialiasing is lost")
+        lines.append("the tag of training with antialiasing is lost")
     if before.up is not None and after.up is None:
         lines.append("the up direction is lost")
     if before.vertical_axis is not None and after.up is None and after.vertical_axis is None:
@@ -53,7 +53,7 @@ def conversion_loss(
     if lines or differences:
         return lines + differences
     if before.notes:
-        return ["every bit that was read is the same; the notes state what was not"]
+        return ["every bit that was read is the same; the notes state what was left out or rounded"]
     return ["nothing is lost: every bit is the same"]
 
 

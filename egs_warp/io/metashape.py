@@ -52,7 +52,8 @@ def read_metashape(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], l
     notes = []
     chunk = max(chunks, key=lambda one: sum(camera.find("transform") is not None for camera in one.iter("camera")))
     if len(chunks) > 1:
-        notes.append(f"of {len(chunks)} chunks, {chunk.get('label', '')!r} is used, which has the most aligned cameras")
+        label = repr(chunk.get("label", ""))
+        notes.append(f"of {len(chunks)} chunks, the one with the most aligned cameras is used: {label}")
     cameras = list(chunk.iter("camera"))
     names = [camera.get("label") or f"camera {camera.get('id')}" for camera in cameras]
     places = files.locate(names, (source.parent / "images", source.parent))

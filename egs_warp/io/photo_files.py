@@ -135,7 +135,7 @@ class PhotoFiles:
             results.append(_only(best, self._root))
         chosen = Counter(one.path for one in results if one.by_name)
         return [
-            FoundFile(None, f"{chosen[one.path]} poses would use {one.path}; give photos names of their own")
+            FoundFile(None, f"{chosen[one.path]} poses would use {one.path}; give each photo its own name")
             if one.by_name and chosen[one.path] > 1
             else one
             for one in results

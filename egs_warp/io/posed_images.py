@@ -106,8 +106,8 @@ def checked_camera(camera: Camera, what: str) -> Camera:
     middle = np.array([camera.cx, camera.cy]) / side
     if not ((focal > 1.0 / _MAX_FOCAL) & (focal < _MAX_FOCAL)).all() or not (abs(middle) < _MAX_CENTRE).all():
         raise UserError(
-            f"{what}: focal lengths {camera.fx:g}, {camera.fy:g} and middle {camera.cx:g}, {camera.cy:g} fit no photo"
-            f" of {camera.width} x {camera.height} pixels; export the poses again"
+            f"{what}: focal lengths {camera.fx:g}, {camera.fy:g} and principal point {camera.cx:g}, {camera.cy:g} fit"
+            f" no photo of {camera.width} x {camera.height} pixels; export the poses again"
         )
     if not (abs(camera.translation) < MAX_COORDINATE).all():
         raise UserError(f"{what}: it lies more than {MAX_COORDINATE:g} units from the origin; export the poses again")

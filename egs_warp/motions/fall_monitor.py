@@ -103,7 +103,7 @@ class FallMonitor:
             before.got_up = True
         elif not getting_up.is_up:
             description = before.fall_note if before is not None else None
-            self.fallen = description or f"the body has not got up at {self._last_time:.2f} s"
+            self.fallen = description or f"the body has not got up by {self._last_time:.2f} s"
 
     def _lying_note(self, state: BodyState, report: StepReport) -> str | None:
         """Describe how a body on the ground lies; None if it stands."""

@@ -115,7 +115,7 @@ def merge_captures(captures: Sequence[Capture]) -> Capture:
         up, vertical_axis = None, None
         notes = (*notes, "the captures have different up directions; they were merged in their own axes")
     if antialiased != any(capture.antialiased for capture in captures):
-        notes = (*notes, "only some of the captures were trained with antialiasing; the mark is dropped")
+        notes = (*notes, "only some of the captures were trained with antialiasing; the tag is dropped")
     cloud = GaussianCloud.from_numpy(
         *(means, rotations, log_scales, logits, np.concatenate(sh)),
         antialiased=antialiased,

@@ -52,7 +52,7 @@ def read_trajectory(path: Path) -> Trajectory:
         raise UserError(f"{path}: is missing; give the folder that egs-warp animate wrote") from error
     except READ_ERRORS as error:
         raise UserError(
-            f"{path}: is not a valid trajectory ({error}); run egs-warp animate again, which writes it"
+            f"{path}: is not a valid trajectory ({error}); run egs-warp animate again to write it"
         ) from error
     return trajectory
 
@@ -89,11 +89,11 @@ class FinishedRun:
         trajectory = read_trajectory(folder / "trajectory.npz")
         creature = RenderData.load(folder / render_data.FILE, node_count=len(trajectory.rest_positions))
         if len(creature.muscle_bounds) != trajectory.activations.shape[1]:
-            advice = "run egs-warp animate again, which writes both"
+            advice = "run egs-warp animate again to write both"
             raise UserError(f"{folder / render_data.FILE}: its muscles differ from those of trajectory.npz; {advice}")
         report = parse_json(read_text(folder / "report.json"), folder / "report.json")
         if not isinstance(report, dict):
-            raise UserError(f"{folder / 'report.json'}: is not a report; run egs-warp animate again, which writes it")
+            raise UserError(f"{folder / 'report.json'}: is not a report; run egs-warp animate again to write it")
         own_background = folder / "background.ply"
         file = background or (own_background if own_background.is_file() else None)
         scene = None

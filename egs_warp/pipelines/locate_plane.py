@@ -116,7 +116,8 @@ def locate_plane(
         up = cloud.up
     if up is None:
         up, reason, tilt = _up_of(cloud, cameras)
-        notes.append(f"up is taken to be {','.join(f'{x:.2f}' for x in up)} ({reason}); if not, say which way is up")
+        direction = ",".join(f"{x:.2f}" for x in up)
+        notes.append(f"up is taken to be {direction} ({reason}); if that is wrong, give the up direction")
     coarse, segmentation = _standing(cloud, spec, up, tilt)
     centre = _middle(cloud, segmentation)
     radius = 0.75 * segmentation.size
@@ -203,7 +204,7 @@ def with_measured_ground(
     try:
         segmentation = segment(cloud, measured.field, with_framing(cloud, spec, cameras), size=located.size)
     except UserError as error:
-        note = f"the ground is rough by {rough} of the object's height, but taken for flat ({error})"
+        note = f"the ground is rough by {rough} of the object's height, but is treated as flat ({error})"
         return replace(located, notes=(*located.notes, note))
     note = (
         f"the ground is not flat: it differs from its plane by {rough} of the object's height (views of it by {noise});"

@@ -142,9 +142,9 @@ class RenderData:
             )
             data._check(node_count)
         except FileNotFoundError as error:
-            raise UserError(f"{path}: is missing; run egs-warp animate again, which writes it") from error
+            raise UserError(f"{path}: is missing; run egs-warp animate again to write it") from error
         except READ_ERRORS as error:
-            raise UserError(f"{path}: cannot be read ({error}); run egs-warp animate again, which writes it") from error
+            raise UserError(f"{path}: cannot be read ({error}); run egs-warp animate again to write it") from error
         return data
 
     def _check(self, node_count: int) -> None:

@@ -40,7 +40,7 @@ class NodeChoice:
         """Return one line for the user."""
         speed = "real-time speed" if self.speed >= 1.0 else f"{self.speed:.1g} of real-time speed"
         return (
-            f"a body of about {self.nodes} nodes is built, which this machine now simulates at about {speed};"
+            f"building a body of about {self.nodes} nodes, for which this machine now reaches about {speed};"
             " give the number of nodes to choose another"
         )
 

@@ -256,7 +256,7 @@ class Session:
                 changed = changed_creature(self.creature, friction=friction, sag=sag, muscles_file=muscles)
                 place = initial_stance(changed)
                 if sag != self.sag and tilt_degrees(self._place, changed.start.positions) > FALLEN_TILT:
-                    raise UserError(f"sag {sag:g}: a body this soft does not stand; choose a smaller sag")
+                    raise UserError(f"sag {sag:g}: a body this soft cannot stand; choose a smaller sag")
             except (UserError, FloatingPointError, np.linalg.LinAlgError) as error:
                 self._mailbox.send_line(str(error))
                 return
