@@ -90,10 +90,11 @@ def nearest_in_half_planes(normals: np.ndarray, offsets: np.ndarray, point: np.n
     ``offsets`` (m,).
 
     It is the point itself, its projection to one edge, or the intersection of two. If the half planes have no common
-    point, it is the candidate that is least outside.
+    point, it is the candidate that is least outside. A point that is not finite, as in a step without a solution, is
+    returned as it is.
     """
     outside = normals @ point - offsets
-    if (outside <= 0.0).all():
+    if not np.isfinite(point).all() or (outside <= 0.0).all():
         return point
     projections = point - outside[:, None] * normals
     i, j = np.triu_indices(len(normals), 1)

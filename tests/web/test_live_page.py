@@ -26,20 +26,20 @@ def test_displayed_time_is_steady_and_never_decreases(chromium: Any, session: Se
         wait_until(page, "egs.live.state?.doing === 'jump'")
         shown = page.evaluate(
             """() => new Promise((resolve) => {
-                const shown = [], began = performance.now();
-                const look = () => {
-                    const elapsed = performance.now() - began;
-                    shown.push([egs.live.clock.time, elapsed / 1000]);
+                // After the page's own callback, with the same time of the image.
+                const shown = [];
+                const look = (now) => {
+                    shown.push([egs.live.clock.time, now / 1000]);
                     if (shown.length < 30) requestAnimationFrame(look); else resolve(shown);
                 };
-                look();
+                requestAnimationFrame(look);
             })"""
         )
         shown, elapsed = np.array(shown).T
         assert np.diff(shown).min() >= 0.0 and shown[-1] > shown[0]
         # If the solver is slower than the screen, a frame of the solver is shown in several images; if the screen is
-        # slow, an image advances by the time that has passed.
-        assert (np.diff(shown) < 0.1 + np.diff(elapsed)).all()
+        # slow, an image advances by about the time that has passed.
+        assert (np.diff(shown) < 0.03 + 1.3 * np.diff(elapsed)).all()
         assert "stand" in page.text_content(".pace") or "jump" in page.text_content(".pace")
 
 
