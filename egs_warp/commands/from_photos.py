@@ -119,7 +119,7 @@ def _source(args: argparse.Namespace) -> _Source:
     if kind == "capture":
         return _Source(None, args.cameras, path)
     if args.cameras is not None:
-        raise UserError("--cameras: the photos bring their cameras with them; leave it out, or give a capture")
+        raise UserError("--cameras: photos with poses already have cameras; leave it out, or give a capture")
     return _Source(path, None, None) if kind == "photos" else _Source(None, path, None)
 
 
@@ -138,7 +138,7 @@ def _check(args: argparse.Namespace, source: _Source) -> None:
     if not (args.out / NAME).is_file():
         for name in (_POSED, _CAPTURE, _PICKED, _FILM):
             if (args.out / name).exists():
-                raise UserError(f"--out {args.out}: it has {name} of another command; choose another folder")
+                raise UserError(f"--out {args.out}: it contains {name} from another command; choose another folder")
     if source.capture is None and args.out.absolute().is_relative_to(Path(args.photos).absolute()):
         raise UserError(f"--out {args.out}: it is in the folder of the photos; choose a folder beside it")
     ffmpeg_program()
@@ -200,7 +200,7 @@ class _Run:
         state = self._record.state(stage, key)
         if state is StageState.FINISHED:
             self._bar.skip(*_BARS[stage])
-            print_note(f"{stage}: finished before, and is used again")
+            print_note(f"{stage}: already finished; its result is used")
             yield None
             return
         if state is StageState.OTHER:

@@ -88,7 +88,7 @@ class SceneInput:
         key = scene_key(self.cloud, self.object, posed=self.posed, up=self.up, plane=self.plane, options=options)
         scene = read_scene(key)
         if scene is not None:
-            print_note(f"the scene was prepared before, and is read from {cache_folder()}")
+            print_note(f"reading the prepared scene from {cache_folder()}")
             return scene
         with scene_bar(options.stages) as show_progress:
 

@@ -47,7 +47,7 @@ def conversion_loss(
         lines.append("the axes are unchanged, but this format's viewers take +y as up")
     if before.origin is not None and origin is None:
         offset = ",".join(f"{x:.12g}" for x in before.origin)
-        lines.append(f"the offset {offset} has no place in this format; the file is relative to it")
+        lines.append(f"the offset {offset} cannot be stored in this format; the file is relative to it")
     shift = np.zeros(3) if origin is None else (0.0 if after.origin is None else after.origin) - origin
     differences = _differences(old, new, order, shift)
     if lines or differences:

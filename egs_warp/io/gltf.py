@@ -204,7 +204,7 @@ class _Asset:
         own = sum(len(part.means) for found in parts.values() for part in found)
         if count > own + _MAX_COPIES:
             raise UserError(
-                f"{self.source}: its instances make up {count} Gaussians of {own}, at most {_MAX_COPIES} more are"
+                f"{self.source}: its instances turn {own} Gaussians into {count}; at most {_MAX_COPIES} more are"
                 " read; export fewer"
             )
 

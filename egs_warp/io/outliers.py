@@ -58,7 +58,7 @@ def without_not_finite(raw: RawCapture, source: Path) -> RawCapture:
             f"{source}: {bad} of {count} Gaussians have a value that is not finite ({name} of number {number});"
             " export it again"
         )
-    note = f"{bad} Gaussians left out that have a value that is not finite ({name} of number {number})"
+    note = f"left out {bad} Gaussians that have a value that is not finite ({name} of number {number})"
     return _subset(raw, good, (*raw.notes, note))
 
 
@@ -107,7 +107,7 @@ def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
         numbers = ", ".join(str(number) for number in np.flatnonzero(out)[:_SHOWN])
         numbers += ", ..." if count > _SHOWN else ""
         why = f"{_why(far, large, bright)} (number {numbers}; the capture's size is {size:.3g})"
-        notes = (*notes, f"{count} Gaussians left out that {why}")
+        notes = (*notes, f"left out {count} Gaussians that {why}")
     flat = int(np.count_nonzero((raw.log_scales < MIN_LOG_SCALE).any(axis=1) & ~out))
     if flat:
         notes = (*notes, f"{flat} Gaussians with a log scale below {MIN_LOG_SCALE:g} read with that value")

@@ -58,7 +58,7 @@ def find_poses(source: Path) -> PoseSource:
     for folder in _folders(source):
         for path in (*(folder / name for name in _JSON_NAMES), *_exports(folder)):
             if path.is_file():
-                return PoseSource(path, source, (f"the poses are those of {path}",))
+                return PoseSource(path, source, (f"poses are read from {path}",))
     raise UserError(
         f"{source}: no camera poses; give a COLMAP model, a cameras.json, a transforms.json, RealityScan's camera"
         " parameters (.csv) or Metashape's cameras (.xml)"

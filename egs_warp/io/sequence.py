@@ -44,7 +44,9 @@ def frame_paths(folder: Path | str, numbers: Iterable[int], ending: str, *, alon
     them.
     """
     if (Path(folder) / MANIFEST).is_file():
-        raise UserError(f"{folder}: it is the folder of a run, which these would be mixed with; choose another folder")
+        raise UserError(
+            f"{folder}: it is the folder of a run, and these files would be mixed with it; choose another folder"
+        )
     paths = [Path(folder) / f"frame{number:04d}{ending}" for number in numbers]
     writable_folder(folder)
     existing = {

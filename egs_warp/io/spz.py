@@ -146,7 +146,7 @@ def _layout(header: bytes, gzipped: bool, source: Path) -> _Layout:
         raise UserError(f"{source}: .spz with SH degree {degree}, expected 0 to 4; export it again")
     if version > 1 and fractional_bits > _MAX_FRACTIONAL_BITS:
         raise UserError(
-            f"{source}: .spz with {fractional_bits} fractional bits of the 24 of a position; export it again"
+            f"{source}: .spz with {fractional_bits} fractional bits, but a position has 24 bits; export it again"
         )
     return _Layout(version, count, _SH_COUNTS[degree], fractional_bits, flags)
 

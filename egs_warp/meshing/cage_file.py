@@ -45,7 +45,7 @@ def read_cage_mesh(path: Path) -> TetMesh:
     if not MIN_NODES <= len(nodes) <= MAX_NODES:
         raise UserError(f"{path}: {len(nodes)} nodes in tetrahedra; give a mesh with {MIN_NODES} to {MAX_NODES}")
     if nodes.shape[1] != 3 or not (np.abs(nodes) <= MAX_COORDINATE).all():
-        raise UserError(f"{path}: a node has no three finite coordinates; write it again")
+        raise UserError(f"{path}: a node does not have three finite coordinates; write it again")
     corners = nodes[tets]
     volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
     turned = volumes <= 0.0 if np.median(volumes) > 0.0 else volumes >= 0.0

@@ -224,7 +224,9 @@ class Act:
         self._layers = [_Layer(stance, gesture, begin) for begin, gesture in gestures]
         whole = [gesture.name for _, gesture in gestures if gesture.moves_whole_body]
         if below is not None and whole:
-            raise UserError(f"{whole[0]}: it moves the whole body, as the motion below does; give one after another")
+            raise UserError(
+                f"{whole[0]}: it and the motion below it both move the whole body; give one after the other"
+            )
         self._end = max(layer.end for layer in self._layers)
         self._stand: Stand | None = None
         self._base: tuple[BodyPart, np.ndarray] | None = None

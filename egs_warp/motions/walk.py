@@ -87,7 +87,7 @@ class Walk:
         body = stance.body
         feet, posture = select_posture(stance)
         if not feet:
-            raise UserError("walk: the body has no feet, and no flat base of which it could lift a side")
+            raise UserError("walk: the body has neither feet nor a flat base with a side that it could lift")
         self.body, self.ground = body, stance.ground
         self.control, self._crouch = control or WalkControl(), crouch
         normal = stance.ground.axes @ stance.ground.surface_normal

@@ -433,7 +433,7 @@ def _check_slope(normal: np.ndarray, up: np.ndarray) -> None:
     if slope > MAX_SLOPE:
         raise ArgumentError(
             "gravity_up",
-            f"that makes the ground a slope of {slope:.0f} degrees; give a direction at most {MAX_SLOPE:g} degrees"
+            f"it makes the ground a slope of {slope:.0f} degrees; give a direction at most {MAX_SLOPE:g} degrees"
             f" from the ground's normal {','.join(f'{x:.3g}' for x in normal)}",
             value=",".join(f"{x:g}" for x in up),
         )

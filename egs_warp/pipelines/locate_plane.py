@@ -158,7 +158,7 @@ def _fallback_plane(cloud: GaussianCloud, spec: ObjectSpec, plane: Plane, notes:
     """Return the object on a ``plane`` that was placed under its lowest parts."""
     segmentation = remove_foot_remnants(cloud, plane, segment(cloud, plane, spec, hover=_MAX_HOVER))
     where = _describe_plane(plane)
-    note = f"{where}: laid under the object's lowest parts, as no view tells where the ground is; see plane.png"
+    note = f"{where}: laid under the object's lowest parts, because no view shows where the ground is; see plane.png"
     return LocatedPlane(
         plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, (*notes, note), in_sight=False
     )
@@ -185,7 +185,7 @@ def with_measured_ground(
         cameras: Cameras of the capture, if known.
 
     Returns:
-        ``located``, with ``ground`` if it is not flat, and a note if the ground is rough but taken as flat.
+        ``located``, with ``ground`` if it is not flat, and a note if the ground is rough but treated as flat.
     """
     if not located.in_sight:
         return located
@@ -199,7 +199,7 @@ def with_measured_ground(
     if measured.is_flat(height):
         if measured.roughness < ROUGH * height:
             return located
-        note = f"the ground seems rough by {rough} of the object's height, but views differ by {noise}: taken as flat"
+        note = f"the ground seems rough by {rough} of the object's height, but views differ by {noise}: treated as flat"
         return replace(located, notes=(*located.notes, note))
     try:
         segmentation = segment(cloud, measured.field, with_framing(cloud, spec, cameras), size=located.size)

@@ -165,9 +165,9 @@ def prepare_scene(
     notes = (*notes, lighting.note)
     filled, hole = None, hole_under(cloud, located.plane, located.segmentation)
     if options.inpaint and hole is None:
-        notes = (*notes, "the object hangs above the ground, which is whole under it")
+        notes = (*notes, "the object hangs above the ground, and the ground under it is complete")
     elif options.inpaint and not located.in_sight:
-        notes = (*notes, "what is under the object was not filled, as no view tells where the ground is")
+        notes = (*notes, "what is under the object was not filled, because no view shows where the ground is")
     elif options.inpaint and hole is not None:
         progress("inpaint", 0.0)
         # torch may be missing, and with it the training that inpainting ends with.
@@ -253,7 +253,7 @@ def snap_to_plane(object_cloud: GaussianCloud, located: LocatedPlane) -> tuple[G
     lowest = float(np.quantile(plane.heights(object_cloud.means.numpy()[object_cloud.opacities() > _SOLID]), 0.002))
     if located.ground is not None or lowest <= _HOVER_FRACTION * size:
         return object_cloud, ()
-    note = f"the object hung {lowest / size:.2f} of its size above the ground, and was set down on it"
+    note = f"the object was {lowest / size:.2f} of its size above the ground, and was lowered onto it"
     return _moved(object_cloud, lambda means: means - lowest * plane.normal), (note,)
 
 

@@ -76,9 +76,7 @@ def masks_of_clicks(
         if mask.any():
             masks.append(MaskedView(small, mask, f"view {number}"))
     if not masks:
-        raise UserError(
-            "object: the network finds nothing where it was clicked; click elsewhere, or do without the network"
-        )
+        raise UserError("object: the network finds nothing at the click; click elsewhere, or do without the network")
     other_clicks = [click for click in clicks if not click.inside]
     for number, camera in enumerate(others, start=len(first)):
         progress(number, len(first) + len(others))

@@ -125,7 +125,7 @@ def test_offsets_are_kept_or_reported(tmp_path: Path, capsys: pytest.CaptureFixt
         assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / name)]) == 0
         said = capsys.readouterr()
         assert "nothing is lost" not in said.out and "positions are relative to 43" in said.err
-        assert ("has no place in this format; the file is relative to it" in said.out) == (name == "b.spz")
+        assert ("cannot be stored in this format; the file is relative to it" in said.out) == (name == "b.spz")
     first, *others = (read_capture(tmp_path / name, device="cpu") for name in ("a.ply", "b.ply", "b.glb"))
     assert first.origin is not None
     for capture in others:
@@ -223,7 +223,7 @@ def test_each_note_of_a_sequence_is_printed_once(tmp_path: Path, capsys: pytest.
         (tmp_path / f"frame{number}.ply").write_bytes(ply_of(columns | {"x": x}))
     assert main(["convert", str(tmp_path), str(tmp_path / "out"), "--to", "ply"]) == 0
     said = capsys.readouterr().err.splitlines()
-    note = "1 Gaussians left out that have a value that is not finite (x of number {})"
+    note = "left out 1 Gaussians that have a value that is not finite (x of number {})"
     assert [line for line in said if "left out" in line] == [
         f"egs-warp: {tmp_path}/frame1.ply: {note.format(3)}",
         f"egs-warp: {tmp_path}/frame2.ply: {note.format(5)} (and 1 more of the files)",

@@ -119,7 +119,7 @@ def test_an_interrupted_run_continues_and_finished_stages_are_used_again(
     monkeypatch.setattr("egs_warp.commands.train.run_train", watched)
     assert photos.run() == 0
     said = capsys.readouterr()
-    assert "pose: finished before, and is used again" in said.err and resumed == [True]
+    assert "pose: already finished; its result is used" in said.err and resumed == [True]
     assert "photos to film: done, " in said.err.split("\r")[-1]
     assert finished_stages(out) == dict.fromkeys(STAGES, True)
     # Each stage can be opened by itself.
@@ -132,12 +132,12 @@ def test_an_interrupted_run_continues_and_finished_stages_are_used_again(
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
     capsys.readouterr()
     assert photos.run() == 0
-    assert capsys.readouterr().err.count("finished before, and is used again") == len(STAGES)
+    assert capsys.readouterr().err.count("already finished; its result is used") == len(STAGES)
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()} == before
     # Another film of the same object.
     assert photos.run("--motion=stand 0.5") == 0
     said = capsys.readouterr().err
-    assert said.count("finished before") == 3 and "film: its input, its flags or its files have changed" in said
+    assert said.count("already finished") == 3 and "film: its input, its flags or its files have changed" in said
     assert (out / "film" / "earlier-1" / "report.json").is_file()
 
 
@@ -160,9 +160,12 @@ def test_poses_and_a_capture_skip_stages(photos: Photos, tmp_path: Path, monkeyp
     [
         (["absent", "--out", "out"], "absent: no such file or folder; give photos, a video, photos with poses"),
         (["photos", "--out", "photos/out"], "--out photos/out: it is in the folder of the photos; choose a folder"),
-        (["photos", "--out", "used"], "--out used: it has capture.ply of another command; choose another folder"),
+        (
+            ["photos", "--out", "used"],
+            "--out used: it contains capture.ply from another command; choose another folder",
+        ),
         (["photos", "--out", "out", "--motion", "jmup"], "motion"),
-        (["photos", "--out", "out", "--cameras", "x"], "--cameras: the photos bring their cameras with them"),
+        (["photos", "--out", "out", "--cameras", "x"], "--cameras: photos with poses already have cameras"),
     ],
 )
 def test_errors_of_later_stages_are_found_first(

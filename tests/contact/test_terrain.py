@@ -94,7 +94,7 @@ def test_a_ground_steeper_than_45_degrees_is_refused() -> None:
     with pytest.raises(UserError) as error:
         make_creature(thing.cloud, plane=thing.plane, options=CreatureOptions(gravity_up=np.array([1.0, 0.0, 0.5])))
     assert str(error.value) == (
-        "gravity_up 1,0,0.5: that makes the ground a slope of 63 degrees; give a direction at most 45 degrees from"
+        "gravity_up 1,0,0.5: it makes the ground a slope of 63 degrees; give a direction at most 45 degrees from"
         " the ground's normal 0,0,1"
     )
 

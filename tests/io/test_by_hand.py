@@ -121,7 +121,7 @@ def test_a_few_negative_scales_of_a_splat_are_left_out(tmp_path: Path) -> None:
     (tmp_path / "a.splat").write_bytes(data)
     capture = read_capture(tmp_path / "a.splat", device="cpu")
     assert capture.cloud.count == 19
-    assert capture.notes == ("1 Gaussians left out that have a value that is not finite (scale_0 of number 4)",)
+    assert capture.notes == ("left out 1 Gaussians that have a value that is not finite (scale_0 of number 4)",)
 
 
 def test_damaged_spz_of_streams_is_one_line(tmp_path: Path) -> None:

@@ -95,7 +95,7 @@ def test_values_that_are_not_finite_are_named(name: str, value: float, tmp_path:
         assert capture.cloud.log_scales.numpy()[4, 1] == -100.0
     else:
         assert capture.cloud.count == 6
-        expected = f"1 Gaussians left out that have a value that is not finite ({name} of number 4)"
+        expected = f"left out 1 Gaussians that have a value that is not finite ({name} of number 4)"
         assert capture.notes == (expected,)
 
 

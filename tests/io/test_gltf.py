@@ -292,7 +292,7 @@ def test_only_the_scene_that_is_shown_is_read(tmp_path: Path) -> None:
 
 def test_too_many_instances(tmp_path: Path) -> None:
     nodes = [{"mesh": 0, "translation": [k, 0, 0]} for k in range(600)]
-    with pytest.raises(UserError, match="its instances make up 3000000 Gaussians of 5000, at most 2097152 more"):
+    with pytest.raises(UserError, match="its instances turn 5000 Gaussians into 3000000; at most 2097152 more"):
         _with_nodes(tmp_path, make_cloud(5000), nodes)
 
 

@@ -59,7 +59,7 @@ def test_outliers_are_left_out_and_reported(values: dict[str, float], said: str,
     rest[[3, 7, 11, 20]] = False
     assert_same_bits(capture.cloud, GOOD.subset(rest))
     assert capture.notes[0].startswith(
-        f"4 Gaussians left out that {said} (number 3, 7, 11, ...; the capture's size is "
+        f"left out 4 Gaussians that {said} (number 3, 7, 11, ...; the capture's size is "
     )
 
 

@@ -195,7 +195,7 @@ def test_rows_that_are_not_finite_are_left_out(layout: str, tmp_path: Path) -> N
     good[[40, 8, 5, 59, 9]] = False
     np.testing.assert_array_equal(capture.cloud.means.numpy(), CLOUD.means.numpy()[good])
     assert capture.notes == (
-        "5 Gaussians left out that have a value that is not finite (scale_1 of number 5)",
+        "left out 5 Gaussians that have a value that is not finite (scale_1 of number 5)",
         "1 infinite opacities were read as 0 or 1",
     )
 

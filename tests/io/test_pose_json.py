@@ -103,5 +103,5 @@ def test_poses_in_a_folder_below(tmp_path: Path) -> None:
     poses = read_posed_images(tmp_path)
     check_paths = [one.image for one in poses.images]
     assert check_paths == [tmp_path / "images" / name for name in NAMES]
-    assert poses.notes == (f"the poses are those of {tmp_path / 'poses' / 'transforms.json'}",)
+    assert poses.notes == (f"poses are read from {tmp_path / 'poses' / 'transforms.json'}",)
     assert json.loads((tmp_path / "poses" / "transforms.json").read_text())["w"] == WIDTH

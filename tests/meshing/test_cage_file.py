@@ -84,7 +84,7 @@ def test_problems_are_one_line(tmp_path: Path) -> None:
     assert "has 2 parts" in refusal(written(path, both, np.concatenate([mesh.tets, mesh.tets + len(mesh.nodes)])))
     sunk = "is 0.12 heights of the mesh below the ground; move it up"
     assert sunk in refusal(written(path, mesh.nodes - [0.0, 0.0, 1.0], mesh.tets))
-    assert "no three finite coordinates" in refusal(written(path, mesh.nodes * 1e30, mesh.tets))
+    assert "a node does not have three finite coordinates" in refusal(written(path, mesh.nodes * 1e30, mesh.tets))
 
 
 @pytest.mark.slow

@@ -148,7 +148,7 @@ def test_a_gesture_of_the_whole_body_needs_a_body_that_stands(person: Stance) ->
     sway = groove(person, {"tempo": 100.0, "beats": 4.0, "sway": 0.04})
     with pytest.raises(UserError) as error:
         Act(person, [(0.0, sway)], Walk(person, straight_route(0.3), 0.1))
-    assert str(error.value) == "groove: it moves the whole body, as the motion below does; give one after another"
+    assert str(error.value) == "groove: it and the motion below it both move the whole body; give one after the other"
     Act(person, [(0.0, sway), (0.5, nod(person, NOD))])
 
 

@@ -270,7 +270,9 @@ def test_a_base_on_ice_cannot_turn() -> None:
 
 def test_missing_feet_and_obstacles_are_reported() -> None:
     bar = block_mesh(12, 3, 3, (2.0, 0.3, 0.3))
-    with pytest.raises(UserError, match="walk: the body has no feet, and no flat base of which it could lift a side"):
+    with pytest.raises(
+        UserError, match="walk: the body has neither feet nor a flat base with a side that it could lift"
+    ):
         Walk(block_place(bar), straight_route(0.2), 0.1)
     place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
     wall = Solid(

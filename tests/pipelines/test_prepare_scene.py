@@ -231,11 +231,11 @@ def test_a_hovering_object_leaves_no_hole(tmp_path: Path) -> None:
     spec = ObjectSpec(point=np.array([0.0, -0.5, 0.83]))
     scene = prepare_scene(cloud, spec, options=SceneOptions(clearing=StraddlingPolicy.SPLIT))
     assert scene.hole is None and scene.filled is None and scene.background is scene.background_with_hole
-    assert "the object hangs above the ground, which is whole under it" in scene.notes
+    assert "the object hangs above the ground, and the ground under it is complete" in scene.notes
     assert scene.object.count >= 0.99 * truth.sum()
     heights = scene.plane.heights(scene.object.means.numpy())
     assert abs(float(heights.min())) < 0.02 and float(heights.max()) == pytest.approx(1.0, abs=0.02)
-    assert any("and was set down on it" in note for note in scene.notes)
+    assert any("and was lowered onto it" in note for note in scene.notes)
     scene.write(tmp_path)
     (known,) = read_planes(tmp_path / "plane.json")
     assert known.hole is None and known.plane.normal[2] > 0.999

@@ -66,10 +66,10 @@ def test_a_second_motion_reads_the_scene(
     monkeypatch.setattr("egs_warp.pipelines.prepare_scene.prepare_scene", prepared)
     given = SceneInput(cloud, [], SPEC, None, FLOOR, ())
     given.prepared(OPTIONS)
-    assert "prepared before" not in capsys.readouterr().err
+    assert "prepared scene" not in capsys.readouterr().err
     again = given.prepared(OPTIONS)
     assert len(calls) == 1
-    assert f"egs-warp: the scene was prepared before, and is read from {folder}" in capsys.readouterr().err
+    assert f"egs-warp: reading the prepared scene from {folder}" in capsys.readouterr().err
     for name in ("object", "background", "background_with_hole"):
         assert bits(getattr(again, name)) == bits(getattr(scene, name)), name
     assert again.notes == scene.notes and again.plane.offset == scene.plane.offset

@@ -139,7 +139,7 @@ def test_real_grounds_that_are_flat_stay_planes(data_dir: Path, file: str, click
     cloud, spec = read_capture(data_dir / "scenes" / file).cloud, ObjectSpec(point=np.array(click))
     located = with_measured_ground(cloud, locate_plane(cloud, spec), spec)
     assert located.ground is None
-    assert any("taken as flat" in note for note in located.notes) == (file == "koala.ply")
+    assert any("treated as flat" in note for note in located.notes) == (file == "koala.ply")
 
 
 def test_ground_is_raised_to_the_object() -> None:

@@ -129,7 +129,7 @@ def test_clicks_without_a_result_are_reported(cameras: list[Camera]) -> None:
         def mask(self, picture: np.ndarray, points: np.ndarray, inside: np.ndarray) -> np.ndarray:
             return np.zeros(picture.shape[:2], bool)
 
-    with pytest.raises(UserError, match="the network finds nothing where it was clicked"):
+    with pytest.raises(UserError, match="the network finds nothing at the click"):
         masks_of_clicks(cloud, [on], cameras, Blind())
 
 

@@ -152,7 +152,7 @@ def test_haze_is_not_filled() -> None:
         box_on_haze(8.0), spec, cameras=cameras, options=SceneOptions(clearing=StraddlingPolicy.SPLIT), plane=None
     )
     assert scene.filled is None and not scene.located.in_sight
-    assert "was not filled, as no view tells" in scene.notes[-1]
+    assert "was not filled, because no view shows" in scene.notes[-1]
 
 
 def test_haze_within_an_object_is_dropped() -> None:
