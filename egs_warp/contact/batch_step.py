@@ -64,7 +64,7 @@ class BatchInputs(BatchedRecord):
     start_gaps: torch.Tensor
     """(c, P) m, gaps of all points at the start of the step."""
     start_faces: torch.Tensor
-    """(c, P) int32, index of the contact plane that each of these gaps is measured to."""
+    """(c, P) int32, index of the nearest contact plane of all points at the start of the step."""
 
     def trial(self, lengths: torch.Tensor, direction: NewtonDirection) -> Trial:
         """Evaluate the trial at the fractions ``lengths`` (c,) of the Newton steps in ``direction``."""
@@ -136,8 +136,8 @@ class BatchSolver(NewtonOptions):
         residual: torch.Tensor,
         forces: torch.Tensor,
     ) -> tuple[NewtonDirection, torch.Tensor]:
-        """Compute the full Newton step of c worlds. Its contact forces satisfy Coulomb's law in the linearised
-        contact model ``response``.
+        """Compute the full Newton step of c worlds. Its contact forces satisfy Coulomb's law in the linearised contact
+        model ``response``.
 
         Args:
             inputs: inputs of the worlds.

@@ -27,8 +27,8 @@ from egs_warp.precision import Mat33, Vec3, Vec4, real
 class ContactSet(BatchedRecord):
     """Active contact points of one step: n of one world, or up to K in each of B worlds.
 
-    The arrays of B worlds have a leading world axis, and each world uses its first ``counts`` entries; the weights of
-    the others are zero. The arrays of one world on the host have no world axis and no padding.
+    The arrays of B worlds have a leading world axis, and each world uses its first ``counts`` entries; its other
+    entries have zero weights. The arrays of one world on the host have no world axis and no padding.
     """
 
     points: Any
@@ -114,8 +114,8 @@ class ContactSet(BatchedRecord):
         return out
 
     def end_gaps(self, dt: float, velocities: Any) -> Any:
-        """Return (n,) or (B, K) m, the gaps after a step of ``dt`` seconds with nodal end velocities (N, 3) or
-        (B, N, 3). On uneven ground, gaps are distances to the tangent plane at the start of the step.
+        """Return (n,) or (B, K) m, the gaps after a step of ``dt`` seconds with nodal end velocities (N, 3) or (B, N,
+        3). On uneven ground, gaps are distances to the tangent plane at the start of the step.
         """
         flat = velocities.reshape(self._shape(3 * self.node_count))
         return self.gaps + dt * self.contact_velocities(flat)[..., 0::3]

@@ -21,7 +21,7 @@ from egs_warp.precision import Vec4, real
 TOLERANCE, MAX_ITERATIONS = 1e-12, 16
 """Residual of the projection equations, m/s, at which Newton's method ends, and its maximum number of steps."""
 FAILURE_TOLERANCE = 1e-8
-"""Residual in m/s above which the solve counts as failed and is repeated by continuation."""
+"""Residual in m/s above which the solve is treated as failed and repeated by continuation."""
 REGULARIZATION_STEPS = (1e-4, 1e-5, 1e-6, 1e-7)
 """Compliances of the continuation: fractions of the mean diagonal of the operator that are added to its diagonal. Each
 solve starts from the forces of the previous one. With many points on few nodes the operator is nearly singular, and

@@ -137,7 +137,7 @@ class CoupledSolver(NewtonOptions):
         )
 
     def with_penetrating_points(self, end: NewtonIterate) -> ContactSet | None:
-        """Return the contacts of ``end`` and the points that would be too deep there; None if there are none."""
+        """Return the contacts of ``end``, extended by the points that are too deep at ``end``; None if no point is."""
         problem, contacts = end.linearization.tangent.problem, end.linearization.contacts
         check, start = end.penetration, problem.state.positions
         if check is not None and not check.is_penetrating:

@@ -39,8 +39,8 @@ MIN_OUTSIDE_FRACTION = 0.1
 _BISECTIONS = 40
 """Bisection steps that shorten an arm to uneven ground."""
 _HULL_BULGE = 1e-7
-"""Relative outward shift of a tetrahedron's points before the hull is computed. It is far above double rounding and
-far below the shift that would turn another point of the grid into a vertex.
+"""Relative outward shift of a tetrahedron's points before the hull is computed. It is far above double rounding and far
+below the shift that would turn another point of the grid into a vertex.
 """
 _CACHED_CONFIGURATIONS = 4
 """Number of configurations whose gaps are cached. The gaps at the start and the end of a step are requested several
@@ -263,8 +263,8 @@ class ContactDetector:
     def gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Evaluate the gaps of all points; the result is cached and read-only.
 
-        The distance to a solid is the largest signed distance to its faces. The distance to uneven ground is defined
-        by ``HeightField.gaps``.
+        The distance to a solid is the largest signed distance to its faces. The distance to uneven ground is defined by
+        ``HeightField.gaps``.
 
         Args:
             positions: (N, 3) m.

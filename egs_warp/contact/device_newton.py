@@ -29,12 +29,12 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy
 
 _CAPACITY_STEP = 8
-"""Contact capacities are multiples of this. Each capacity has buffers and graphs of its own."""
+"""Contact capacities are multiples of this. Each capacity has separate buffers and graphs."""
 
 
 class DeviceContactLinearizer(StepWorkspace, ContactLinearizer):
-    """Builder of the contact linearisations of one body with dense factors, on the device that holds its elements.
-    Only the last linearisation, ``current``, can be used.
+    """Builder of the contact linearisations of one body with dense factors, on the device that holds its elements. Only
+    the last linearisation, ``current``, can be used.
     """
 
     is_on_host = False

@@ -5,11 +5,10 @@ One vector holds an iterate (see ``NewtonWorkspace.parts``). The workspace has t
 buffer that the host fills.
 
 A Newton loop consists of three graphs. ``_enqueue_loop_start`` copies the row of ``NewtonProgress`` and sets the loop
-condition.
-``_enqueue_next_step`` is the loop body: it solves Coulomb's law at the contact-free velocities of the last trial, makes
-that trial the base, takes the full Newton step to a new trial, evaluates the residual, the contact-free velocities and
-the penetration test there, and judges the trial. ``_enqueue_end`` prefetches the contacts of the next step and starts
-the download.
+condition. ``_enqueue_next_step`` is the loop body: it solves Coulomb's law at the contact-free velocities of the last
+trial, makes that trial the base, takes the full Newton step to a new trial, evaluates the residual, the contact-free
+velocities and the penetration test there, and judges the trial. ``_enqueue_end`` prefetches the contacts of the next
+step and starts the download.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ class TrialReadback(NamedTuple):
     free_contact_velocities: np.ndarray
     """(3K,) m/s, contact velocities after a Newton step from the trial without contact forces."""
     velocities: np.ndarray
-    """(3N,) m/s."""
+    """(3N,) m/s, velocities of the trial."""
     coulomb_violation: np.ndarray
     """(1,) m/s, residual of the last Coulomb solve."""
     forces: np.ndarray
@@ -475,8 +474,8 @@ class NewtonWorkspace:
         self._start_download()
 
     def enqueue_prediction(self, dt: float, ratio: float) -> None:
-        """Queue the Newton step of ``predict_velocities`` from the trial that ``trial_input`` describes. ``ratio`` is
-        1 + dt drag.
+        """Queue the Newton step of ``predict_velocities`` from the trial that ``trial_input`` describes. ``ratio`` is 1
+        + dt drag.
         """
         owner, factors = self.owner, self.owner.factors
         self._indices.copy_(self._packed_indices)

@@ -189,8 +189,8 @@ class StepWorkspace:
             ends: (3N,) m, positions at the start of the next step.
             velocities: (3N,) m/s, velocities there.
             dt: step size, s.
-            before: contact points (K,) int32 of the current step, their number (1,) int32 and their normal forces
-                (K,) newtons.
+            before: contact points (K,) int32 of the current step, their number (1,) int32 and their normal forces (K,)
+                newtons.
         """
         self._enqueue_ballistic(ends, velocities, dt, self._next_ballistic)
         self.prefetch.enqueue_next((self._ends[0], vectors(ends)), vectors(self._next_ballistic), *before)

@@ -52,17 +52,17 @@ class IterateBuffer:
 
     @property
     def velocities(self) -> np.ndarray:
-        """(N, 3) m/s."""
+        """(N, 3) m/s, nodal velocities."""
         return self._all[: self._ends[0]].reshape(-1, 3)
 
     @property
     def free_velocities(self) -> np.ndarray:
-        """(N, 3) m/s after a Newton step without contact forces."""
+        """(N, 3) m/s, nodal velocities after a Newton step without contact forces."""
         return self._all[self._ends[0] : self._ends[1]].reshape(-1, 3)
 
     @property
     def forces(self) -> np.ndarray:
-        """(n, 3) newtons."""
+        """(n, 3) newtons, contact forces."""
         return self._all[self._ends[2] : self._ends[3]].reshape(-1, 3)
 
     @property

@@ -175,12 +175,12 @@ class NewtonIterate(Protocol):
 
     @property
     def velocities(self) -> np.ndarray:
-        """(N, 3) m/s."""
+        """(N, 3) m/s, nodal velocities at the end of the step."""
         ...
 
     @property
     def forces(self) -> np.ndarray:
-        """(n, 3) newtons."""
+        """(n, 3) newtons, contact forces."""
         ...
 
     @property
@@ -261,12 +261,12 @@ class NativeNewtonIterate:
 
     @property
     def velocities(self) -> np.ndarray:
-        """(N, 3) m/s."""
+        """(N, 3) m/s, nodal velocities at the end of the step."""
         return self.state.velocities
 
     @property
     def forces(self) -> np.ndarray:
-        """(n, 3) newtons."""
+        """(n, 3) newtons, contact forces."""
         return self.state.forces
 
     @property

@@ -140,8 +140,8 @@ class ContactPrefetch:
         return self._buffers_for(capacity).selection.contact_set(len(self._detector.geometry.mesh.nodes))
 
     def deepest(self, capacity: int) -> ContactSet:
-        """Return the deepest penetrating point of each cell, sorted by depth, deepest first. The step is the one that
-        was current when ``enqueue_next`` was called with ``capacity`` points.
+        """Return the deepest penetrating point of each cell, sorted by depth, deepest first, for the step that was
+        current when ``enqueue_next`` was called with ``capacity`` points.
         """
         return self._buffers_for(capacity).deepest.contact_set(len(self._detector.geometry.mesh.nodes))
 

@@ -24,8 +24,8 @@ there.
 _MIN_SPACING = 0.4
 """Minimum spacing of the cells in mean edge lengths of the cage, so that small feet stand on several cells."""
 GAP_TOLERANCE_FRACTION = 1e-7
-"""Gap tolerance as a fraction of the activation distance. Of points whose gaps are equal within it, the one closest
-to the centre of the cell is selected. Without it, rounding errors in the points of a flat sole would select different
+"""Gap tolerance as a fraction of the activation distance. Of points whose gaps are equal within it, the one closest to
+the centre of the cell is selected. Without it, rounding errors in the points of a flat sole would select different
 points on different machines.
 """
 ACTIVATION_DEPTH = 0.6

@@ -31,7 +31,7 @@ class TrialStep:
     gravity: Any
     """Vec3, m/s^2."""
     node_mass: torch.Tensor
-    """(N,) kg."""
+    """(N,) kg, lumped masses."""
     positions: torch.Tensor
     """(c, N, 3) m, at the start of the step."""
     velocities: torch.Tensor
@@ -81,7 +81,7 @@ class Trial(BatchedRecord):
 
     @classmethod
     def empty(cls, velocities: torch.Tensor, forces: torch.Tensor) -> Trial:
-        """Allocate a trial for velocities and forces of these shapes."""
+        """Allocate a trial whose velocities and forces have the shapes of ``velocities`` and ``forces``."""
         nodal = [torch.empty_like(velocities) for _ in range(5)]
         torque = velocities.new_empty((len(velocities), 3))
         return cls(nodal[0], torch.empty_like(forces), nodal[1], nodal[2], torque, nodal[3], nodal[4])

@@ -163,7 +163,7 @@ class BatchProblem(ImplicitStep):
 
     @property
     def gravity(self) -> torch.Tensor:
-        """(3,) m/s^2."""
+        """(3,) m/s^2, gravitational acceleration."""
         return self.worlds.gravity
 
     def is_inversion_free(self, velocities: torch.Tensor) -> torch.Tensor:

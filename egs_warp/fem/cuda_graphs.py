@@ -118,10 +118,10 @@ class GraphStream:
     def record(self, work: Callable[[], None], *, keep: bool = False) -> torch.cuda.CUDAGraph:
         """Capture the device operations of ``work`` in a graph without executing them.
 
-        All graphs share one pool of temporary memory. They may, because they run one after the other and leave no
-        results there. The first graph is retained, since the pool is released with its last graph. No other thread may
-        use the device during a capture, as its operations would be captured too. Python's garbage collection is
-        disabled during a capture, since freeing device memory would synchronize with the device.
+        All graphs share one pool of temporary memory, because they run sequentially and leave no results in it. The
+        first graph is retained, since the pool is released with its last graph. No other thread may use the device
+        during a capture, as its operations would be captured too. Python's garbage collection is disabled during a
+        capture, since freeing device memory would synchronize with the device.
 
         Args:
             work: operations to capture.

@@ -20,7 +20,7 @@ class FrontLayout:
     """Index maps of the fronts, and the sizes of the arrays in float64 numbers."""
 
     fronts: Any
-    """``kernels.fem.supernodal.Fronts``, the index maps as the kernels read them."""
+    """``kernels.fem.supernodal.Fronts``, the struct with the index maps for the kernels."""
     front: int
     """Size of the largest front. It is stored row by row, and row lengths are padded to multiples of 8."""
     scratch: int

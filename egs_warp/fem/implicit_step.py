@@ -30,7 +30,7 @@ class StepValues(Protocol):
     node_mass: Any
     """(N,) kg, lumped masses."""
     gravity: Any
-    """(3,) m/s^2."""
+    """(3,) m/s^2, gravitational acceleration."""
     rotation_modes: Any
     """(..., 3N, 3) m, nodal velocities e_k x r of unit rotations about the centre of mass, with lever arms r."""
     inverse_inertia: Any

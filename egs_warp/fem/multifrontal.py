@@ -24,7 +24,7 @@ from egs_warp.launching import launch_cached, run_concurrently, zeros
 from egs_warp.precision import real
 
 _MIN_RELATIVE_PIVOT = 1e-14
-"""Smallest pivot, as a fraction of the largest diagonal entry; a matrix with a pivot that is not larger is singular."""
+"""Pivot threshold, as a fraction of the largest diagonal entry. A matrix with a pivot at or below it is singular."""
 
 
 @dataclass(frozen=True)
@@ -287,7 +287,7 @@ class MultifrontalLdl:
 
 
 class _ProjectionArrays:
-    """Arrays of a momentum projection as the kernels read them."""
+    """Arrays of a momentum projection and the struct through which the kernels access them."""
 
     def __init__(self, unknowns: int) -> None:
         self.struct = kernels.MomentumProjection()

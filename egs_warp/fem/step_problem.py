@@ -37,7 +37,7 @@ class StepProblem(ImplicitStep):
 
     @property
     def gravity(self) -> np.ndarray:
-        """(3,) m/s^2."""
+        """(3,) m/s^2, gravitational acceleration."""
         return self.body.gravity
 
     @cached_property

@@ -225,8 +225,8 @@ class FrictionDirections:
 
     @classmethod
     def pyramid(cls, directions: int, first: float, sector: float) -> FrictionDirections:
-        """Return the pyramid inside the cone with ``directions`` faces; ``first`` is the angle of its first face in
-        radians, and ``sector`` the field."""
+        """Return directions with a pyramid of ``directions`` faces inside the cone, of which the first is at the angle
+        ``first`` in radians, and with the given ``sector``."""
         angles = [first + 2.0 * math.pi * face / directions for face in range(directions)]
         width = math.cos(math.pi / directions)
         return cls(np.array([(width, -math.cos(angle), -math.sin(angle)) for angle in angles]), sector)
@@ -385,7 +385,7 @@ def _next_modes(
     program: CoulombProgram, modes: ContactModes, optimum: ModeRegionOptimum
 ) -> tuple[ContactModes, ContactModes | None]:
     """Return the modes beyond all active constraints of ``optimum``, which lies in the region of ``modes``, and the
-    modes beyond its constraint with the largest multiplier alone; None for the latter if only one is active."""
+    modes beyond its constraint with the largest multiplier alone; the second is None if only one is active."""
     neighbours = _NextModes(program, modes, optimum.x)
     constraints = optimum.contact, optimum.transition, optimum.multiplier
     after_all = neighbours.after_transitions(*constraints)

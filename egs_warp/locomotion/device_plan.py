@@ -322,7 +322,7 @@ class PlanWorkspace:
         return search_modes(program, start, modes, qp_limit=limit, solver=QpSolver.OSQP)
 
     def _enqueue_restart(self) -> None:
-        """Queue the relaxed optimum and a search from there."""
+        """Queue the solve for the relaxed optimum, and a search that starts from it."""
         # Make Warp launch on PyTorch's current stream.
         with wp.ScopedStream(self.body.stream.current(), sync_enter=False):
             self._relaxed.enqueue()

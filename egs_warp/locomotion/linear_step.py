@@ -62,8 +62,8 @@ class StepInputs:
 
 @dataclass(frozen=True)
 class LinearStep:
-    """End velocity v(x) and change of angular momentum of a step, as affine functions of the k unknowns
-    x = (activations, contact forces)."""
+    """End velocity v(x) and change of angular momentum of a step, as affine functions of the k unknowns x =
+    (activations, contact forces)."""
 
     velocities: Any
     """(3N, k + 1) m/s: derivative of the end velocity with respect to x, and in the last column v(0), without muscles

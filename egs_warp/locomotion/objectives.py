@@ -133,7 +133,7 @@ def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.nda
     """Return the objective that drives the mean stretch and shear rates of the body to the rates of the ``target``
     velocities. It leaves finer deformations to elasticity, and translation and rotation to other objectives.
 
-    The six rows are orthonormal in the mass-weighted mean, so the weight is comparable with that of
+    The six rows are orthonormal in the mass-weighted mean, so the weight is comparable with the weight of
     ``node_velocities``.
 
     Args:
@@ -347,8 +347,8 @@ def no_slip_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> 
 
 
 def _along(shares: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return (k, 3N), rows that map nodal velocities to their mean with weights ``shares`` (N,), along ``axes``
-    (k, 3)."""
+    """Return (k, 3N), rows that map nodal velocities to their mean with weights ``shares`` (N,), along ``axes`` (k,
+    3)."""
     return (axes[:, None, :] * shares[:, None]).reshape(len(axes), -1)
 
 

@@ -32,8 +32,7 @@ class LocomotionSettings:
     """
     activation_weight: float = 2e-4
     """Weight of squared activations, for a step of sqrt(H / g) / 19 and a muscle of 4 body weights. The weight is
-    scaled with the square of the step size, because shorter steps change velocities by less, and with the muscle's
-    force.
+    scaled with the square of the step size, because shorter steps change velocities less, and with the muscle's force.
     """
     activation_change_weight: float = 3e-3
     """Weight of squared changes of activation, for the same step and muscle. It is scaled with the step size and with

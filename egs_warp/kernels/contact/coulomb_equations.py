@@ -16,8 +16,7 @@ wp.set_module_options({"enable_backward": False})
 _ACROSS = wp.constant(32)
 """Number of threads that share a row of the equations."""
 _SINGULAR = wp.constant(real(1e-14))
-"""Relative pivot threshold. An unknown whose pivot is not above this fraction of the largest pivot so far stays zero.
-"""
+"""Relative pivot threshold. An unknown stays zero if its pivot is not above this fraction of the largest so far."""
 
 
 @wp.struct

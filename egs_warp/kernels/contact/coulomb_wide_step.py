@@ -1,6 +1,6 @@
 """Newton step of the Coulomb solve by a block of threads on a GPU, for 121 to 256 unknowns.
 
-The method is the one of ``coulomb_step``, in passes of 64 columns.
+The method is the same as in ``coulomb_step``, in passes of 64 columns.
 """
 
 import warp as wp

@@ -32,7 +32,7 @@ class Step:
     inverse_inertia: wp.array[real]
     """(9,) 1/(kg m^2), inverse inertia tensor."""
     masses: wp.array[real]
-    """(N,) kg."""
+    """(N,) kg, lumped masses."""
 
 
 @wp.func_native(
@@ -135,8 +135,8 @@ def step_residual(
     free_residual_out: wp.uint64,
     residual: wp.array2d[real],
 ) -> real:
-    """Compute the residual (``ImplicitStep.residual``) without contact forces (3N,) and with contact forces (N, 3), N
-    s. Return the norm of the latter.
+    """Compute the residual (``ImplicitStep.residual``) in N s, without contact forces (3N,) and with them (N, 3);
+    return the norm of the residual with contact forces.
     """
     ...
 

@@ -7,8 +7,8 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 REFACTOR_RATIO = 0.7
-"""The tangent is updated if a step leaves more than this fraction of the residual. The first step of a round is
-exempt, because it creates the forces of new contacts. Computing a new tangent takes as long as many steps.
+"""The tangent is updated if a step leaves more than this fraction of the residual. The first step of a round is exempt,
+because it creates the forces of new contacts. Computing a new tangent takes as long as many steps.
 """
 MIN_DECREASE = 1e-4
 """Sufficient decrease of a full step, as a fraction of the largest recent residual."""
@@ -136,7 +136,7 @@ def judge_step(progress: wp.array2d[real], world: int, size: real, violation: re
         progress[world, _RECENT + k] = progress[world, _RECENT + k + 1]
     progress[world, _RECENT + _WINDOW - 1] = size
     progress[world, _RESIDUAL] = size
-    # By linearity, the contact velocities after a full step equal those of the Coulomb solve.
+    # By linearity, the Coulomb solve has computed the contact velocities after a full step, so they satisfy the law.
     is_consistent = length == real(1.0) and not is_violated
     if not is_consistent or (not is_first and size > _REFACTOR_RATIO * before):
         outcome |= _NEEDS_TANGENT
@@ -166,7 +166,7 @@ def judge_steps_kernel(
     """Judge the last trial of each world, and decide whether a loop on the device may continue without the host.
 
     Args:
-        failure_tolerance: violation in m/s above which the Coulomb solve counts as a numerical failure.
+        failure_tolerance: violation in m/s above which the Coulomb solve has failed numerically.
         sizes: (c,) residuals of the trials, in the ``UNIT`` of the row.
         violations: (c,) m/s, violations of Coulomb's law by the forces of the trials.
         penetrating: (c,) number of points that penetrate too far.

@@ -1,7 +1,7 @@
 """Dual active-set method of Goldfarb and Idnani (1983), for all threads of a block on a GPU or one thread on a CPU.
 
-The problem is min 1/2 z^T z subject to l <= free + R z <= u, where the rows of R have length 1. The solution is
-z = R^T (s p), where p >= 0 are the multipliers of the active rows and s = +1 or -1 the sides at which they are active.
+The problem is min 1/2 z^T z subject to l <= free + R z <= u, where the rows of R have length 1. The solution is z = R^T
+(s p), where p >= 0 are the multipliers of the active rows and s = +1 or -1 the sides at which they are active.
 
 The inverse of the products of the active rows is stored instead of their Cholesky factor, and updated as rows are added
 and dropped, because on a GPU a triangular solve synchronises the threads once per row, while a matrix product does not.
@@ -64,7 +64,9 @@ class UnitConstraints:
     values_at_origin: wp.array[real]
     """(m,) row values at z = 0."""
     lower: wp.array[real]
+    """(m,) lower bounds of the rows."""
     upper: wp.array[real]
+    """(m,) upper bounds of the rows."""
     slack: wp.array[real]
     """(m,) amount by which a row may violate its bounds."""
     cost_limit: real
@@ -104,8 +106,9 @@ class ActiveSet:
     dual_direction: wp.array[real]
     """(k,) ``inverse`` times the inner products of the entering row with the active rows."""
     scratch_a: wp.array[real]
+    """(n,) scratch memory."""
     scratch_b: wp.array[real]
-    """(n,) scratch."""
+    """(n,) scratch memory."""
     entering_row: wp.array[real]
     """(n,) entering row."""
     orthogonal_part: wp.array[real]
