@@ -353,5 +353,5 @@ def _along(shares: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 
 def _gyration(part: BodyPart, points: np.ndarray) -> float:
-    """Return the radius of gyration of ``part`` at ``points`` (N, 3) m, m."""
+    """Return the radius of gyration, m, of ``part`` with nodes at ``points`` (N, 3) m."""
     return float(np.sqrt(0.5 * np.trace(part.inertia(points)) / part.masses.sum()))

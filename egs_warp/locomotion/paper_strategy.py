@@ -84,8 +84,8 @@ def search_states(
 def predicted_modes(predicted: PredictedContact, friction: float, directions: int) -> ContactModes:
     """Return the predicted states as modes (Eq. 12).
 
-    A loaded contact is static if its force is inside the friction cone. Otherwise it slides, with friction along the
-    direction D_k that opposes the predicted slip most.
+    A contact without load is free. A loaded contact sticks if its force is inside the friction cone. Otherwise it
+    slides, with friction along the direction D_k that opposes the predicted slip most.
 
     Args:
         predicted: predicted contact.
