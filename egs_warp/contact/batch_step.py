@@ -1,6 +1,6 @@
 """Steps with contact of many worlds in lockstep on the device (Eq. 4, 8, 9).
 
-Every world makes the decisions of ``coupled_step``; converged worlds are left out of later iterations.
+Each world follows the algorithm of ``coupled_step``; later iterations skip the worlds that have converged.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def no_timer(name: str) -> AbstractContextManager[object]:
 
 @dataclass(frozen=True)
 class BatchLinearization(BatchedRecord):
-    """``ContactLinearization`` of c worlds, with the tangents in their slots."""
+    """``ContactLinearization`` of c worlds. Their factored tangents stay in the slots of the ``BatchProblem``."""
 
     momentum_projection: MomentumProjection
     columns: torch.Tensor
@@ -64,10 +64,10 @@ class BatchInputs(BatchedRecord):
     start_gaps: torch.Tensor
     """(c, P) m, gaps of all points at the start of the step."""
     start_faces: torch.Tensor
-    """(c, P) int32, their faces."""
+    """(c, P) int32, index of the nearest contact plane of all points at the start of the step."""
 
     def trial(self, lengths: torch.Tensor, direction: NewtonDirection) -> Trial:
-        """Evaluate the trial at the fractions ``lengths`` (c,) of Newton steps."""
+        """Evaluate the trial at the fractions ``lengths`` (c,) of the Newton steps in ``direction``."""
         problem, trial = self.problem, Trial.empty(direction.velocities, direction.forces)
         step = TrialStep(
             *(problem.dt, problem.inertia_ratio, Vec3(*(float(each) for each in problem.body.gravity))),
@@ -87,7 +87,7 @@ class BatchInputs(BatchedRecord):
         torch.bmm(self.problem.rotation_modes.mT, gradient.flatten(1)[:, :, None], out=torque[:, :, None])
 
     def residual_norms(self, trial: Trial) -> torch.Tensor:
-        """Return (c,), the norms of the residuals of a ``trial``, divided by dt x weight."""
+        """Return (c,), the residual norms of a ``trial``, divided by dt x weight."""
         return trial.residual.flatten(1).norm(dim=1) / self.problem.residual_scale
 
 
@@ -96,17 +96,17 @@ class BatchResult(BatchedRecord):
     """``CoupledResult`` of c worlds."""
 
     velocities: torch.Tensor
-    """(c, N, 3) m/s."""
+    """(c, N, 3) m/s, at the end of the step."""
     forces: torch.Tensor
-    """(c, K, 3) newtons."""
+    """(c, K, 3) newtons, contact forces."""
     converged: torch.Tensor
     """(c,) bool."""
     iterations: torch.Tensor
-    """(c,) int64."""
+    """(c,) int64, number of Newton steps."""
     is_singular: torch.Tensor
     """(c,) bool, True if a tangent could not be factored (``UnsolvableStepError``)."""
     contacts_added: torch.Tensor
-    """(c,) bool, True if the round ended because points must be added."""
+    """(c,) bool, True if the round ended because points must be added to the contacts."""
 
 
 @dataclass(frozen=True)
@@ -114,12 +114,13 @@ class BatchSolver(NewtonOptions):
     """``CoupledSolver`` for many worlds."""
 
     stages: StageTimer = no_timer
+    """Timer of the stages of a step."""
 
     def linearize(
         self, problem: BatchProblem, contacts: ContactSet, momentum_projection: MomentumProjection | None = None
     ) -> BatchLinearization:
-        """Linearise ``contacts`` with the tangents in the worlds' slots; the momentum projection is computed unless it
-        is passed.
+        """Linearise ``contacts`` with the tangents in the worlds' slots of ``problem``. The momentum projection is
+        computed unless it is passed.
         """
         with self.stages("substitute"):
             impulses = problem.dt * contacts.jacobian_transposed()
@@ -135,18 +136,18 @@ class BatchSolver(NewtonOptions):
         residual: torch.Tensor,
         forces: torch.Tensor,
     ) -> tuple[NewtonDirection, torch.Tensor]:
-        """Compute the full Newton step of c worlds, with the contact forces that satisfy Coulomb's law at the
-        velocities without them.
+        """Compute the full Newton step of c worlds. Its contact forces satisfy Coulomb's law in the linearised contact
+        model ``response``.
 
         Args:
             inputs: inputs of the worlds.
             response: linearisation of their contacts.
-            velocities: (c, N, 3) m/s, at the start.
-            residual: (c, N, 3) N s, residual there without contact forces.
+            velocities: (c, N, 3) m/s, at the start of the Newton step.
+            residual: (c, N, 3) N s, residual at ``velocities`` without contact forces.
             forces: (c, K, 3) newtons, initial forces of the Coulomb solve.
 
         Returns:
-            The step, and (c,) m/s, the violation of Coulomb's law by its forces.
+            The Newton step, and (c,) m/s, the violation of Coulomb's law by its forces.
         """
         contacts = inputs.contacts
         with self.stages("substitute"):
@@ -211,8 +212,15 @@ class BatchSolver(NewtonOptions):
         return contacts, result
 
     def points_to_add(self, inputs: BatchInputs, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (c, C), the points of each cell that would be too deep at the end of the step with ``velocities`` (c,
-        N, 3), or -1, and (c, P) m, all gaps at the end.
+        """Find the points that must be added to the contacts.
+
+        Args:
+            inputs: inputs of c worlds.
+            velocities: (c, N, 3) m/s, end velocities.
+
+        Returns:
+            (c, C), for each cell the deepest point that would be too deep at the end of the step, or -1; and (c, P) m,
+            the gaps of all points at the end of the step.
         """
         gaps, _ = self.detector.gaps_of_worlds(inputs.problem.end_positions(velocities))
         tolerance = self.penetration_tolerance
@@ -232,8 +240,8 @@ class _BatchRound:
         *,
         last: bool,
     ) -> None:
-        """Start a round, in which no points are added if it is the ``last``. ``velocities`` (c, N, 3) m/s and
-        ``forces`` (c, K, 3) newtons are updated in place, and so is ``response``, the linearisation.
+        """Start a round; the ``last`` round adds no points. ``velocities`` (c, N, 3) m/s, ``forces`` (c, K, 3) newtons
+        and the linearisation ``response`` are updated in place.
         """
         self._solver, self._inputs, self.response = solver, inputs, response
         self._velocities, self._forces = velocities, forces
@@ -263,7 +271,7 @@ class _BatchRound:
         return nonzero(self._is_active & has_outcome(self._progress, bits))
 
     def take_step(self, worlds: torch.Tensor) -> None:
-        """Judge the trials at the ends of full Newton steps."""
+        """Evaluate and judge the trials at the ends of full Newton steps."""
         part = self._inputs.subset(worlds)
         start = self._velocities[worlds], self._free_residual[worlds], self._forces[worlds]
         direction, violation = self._solver.newton_step(part, self.response.subset(worlds), *start)
@@ -272,7 +280,7 @@ class _BatchRound:
         self._try(worlds, part)
 
     def halve_step(self, worlds: torch.Tensor) -> None:
-        """Judge the trials at the reduced lengths."""
+        """Evaluate and judge the trials at the reduced step lengths."""
         self._try(worlds, self._inputs.subset(worlds))
 
     def _try(self, worlds: torch.Tensor, part: BatchInputs) -> None:
@@ -291,14 +299,16 @@ class _BatchRound:
         self._is_active &= ~has_outcome(self._progress, bits)
 
     def check_penetration(self, worlds: torch.Tensor) -> None:
-        """End the round of those of the ``worlds`` in which points must be added to the contacts."""
+        """End the round of each of the ``worlds`` whose contacts must be extended by penetrating points."""
         with self._solver.stages("detect"):
             added, _ = self._solver.points_to_add(self._inputs.subset(worlds), self._velocities[worlds])
         self._contacts_added[worlds] = (added >= 0).any(dim=1)
         self._is_active &= ~self._contacts_added
 
     def renew_tangent(self, worlds: torch.Tensor) -> None:
-        """Factor and linearise the ``worlds`` at their velocities, and end the round of those without factors."""
+        """Factor the tangents of the ``worlds`` at their velocities and linearise their contacts. End the round of
+        worlds whose tangent cannot be factored.
+        """
         part = self._inputs.subset(worlds)
         with self._solver.stages("factor"):
             factored = part.problem.factor(self._velocities[worlds], part.tensions)

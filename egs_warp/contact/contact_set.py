@@ -1,10 +1,11 @@
 """The contacts of a step, in one world or in many, and the products with their Jacobian W (Eq. 8).
 
-A contact is a point of the surface that moves with the four nodes of its tetrahedron, and a frame of a unit normal and
-two unit tangents. W maps nodal velocities to contact velocities in these frames, W^T contact forces to nodal forces.
+A contact consists of a surface point that moves with the four nodes of its tetrahedron, and a frame of a unit normal
+and two unit tangents. W maps nodal velocities to contact velocities in these frames; W^T maps contact forces to nodal
+forces.
 
-``ContactSet`` is the record of contacts for one world on the host, one on a GPU and many. Its arrays are NumPy arrays
-or PyTorch tensors, and the kernels in ``kernels/contact/contacts.py`` compute the products in the memory of either.
+``ContactSet`` is the record of contacts for one world on the host, one world on a GPU, and many worlds. Its arrays are
+NumPy arrays or PyTorch tensors; the kernels in ``kernels/contact/contacts.py`` accept both without copying.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from egs_warp.precision import Mat33, Vec3, Vec4, real
 class ContactSet(BatchedRecord):
     """Active contact points of one step: n of one world, or up to K in each of B worlds.
 
-    The arrays of B worlds have a leading world axis, and each world uses its first ``counts`` entries; the weights of
-    the others are zero. The arrays of one world on the host have no world axis and no padding.
+    The arrays of B worlds have a leading world axis, and each world uses its first ``counts`` entries; its other
+    entries have zero weights. The arrays of one world on the host have no world axis and no padding.
     """
 
     points: Any
@@ -89,8 +90,8 @@ class ContactSet(BatchedRecord):
         return out
 
     def contact_velocities(self, velocities: Any, out: Any = None) -> Any:
-        """Return W v, (3n,) or (B, 3K) m/s, for nodal velocities v (3N,) or (B, 3N). A further axis of velocities is
-        one of the result; ``out`` is memory for it.
+        """Return W v, (3n,) or (B, 3K) m/s, for nodal velocities v (3N,) or (B, 3N). If v has a trailing axis of
+        columns, so has the result. ``out`` is memory for the result.
         """
         shape = self._shape(3 * self.capacity, *velocities.shape[self.points.ndim :])
         out = empty_like(velocities, shape) if out is None else out
@@ -113,8 +114,8 @@ class ContactSet(BatchedRecord):
         return out
 
     def end_gaps(self, dt: float, velocities: Any) -> Any:
-        """Return (n,) or (B, K) m, the gaps after a step of ``dt`` seconds with nodal end velocities (N, 3) or
-        (B, N, 3). On uneven ground they are measured to the tangent plane at the start.
+        """Return (n,) or (B, K) m, the gaps after a step of ``dt`` seconds with nodal end velocities (N, 3) or (B, N,
+        3). On uneven ground, gaps are distances to the tangent plane at the start of the step.
         """
         flat = velocities.reshape(self._shape(3 * self.node_count))
         return self.gaps + dt * self.contact_velocities(flat)[..., 0::3]
@@ -124,7 +125,7 @@ class ContactSet(BatchedRecord):
         return 1 if self.counts is None else len(self.counts)
 
     def _shape(self, *of_one_world: int) -> tuple[int, ...]:
-        """Return the shape of an array with that shape in each world."""
+        """Return the shape of an array whose part of each world has the shape ``of_one_world``."""
         return (*self.points.shape[:-1], *of_one_world)
 
     @cached_property
@@ -153,12 +154,12 @@ class ContactSet(BatchedRecord):
         """Map the contact forces of the previous step to these contacts.
 
         Args:
-            before: (m,) or (B, L), points of the previous step.
-            forces: (m, 3) or (B, L, 3) newtons, their forces.
-            counts: (B,) number of valid points in each world, or None.
+            before: (m,) or (B, L), contact points of the previous step.
+            forces: (m, 3) or (B, L, 3) newtons, contact forces at these points.
+            counts: (B,) number of valid entries of ``before`` in each world, or None.
 
         Returns:
-            (n, 3) or (B, K, 3) newtons; zero for new points.
+            (n, 3) or (B, K, 3) newtons; zero for points that had no contact before.
         """
         is_same = self.points[..., None] == before[..., None, :]
         if counts is not None:
@@ -191,8 +192,9 @@ def valid_entries(counts: Any, capacity: int) -> Any:
 
 
 def push_out_speeds(gaps: Any, dt: float, cap: float, factor: float, slop: float) -> Any:
-    """Return the terms, in m/s, of the normal measure c = N^T u' + max(phi, 0) / dt + max(min(phi + slop, 0) b / dt,
-    -cap) that do not depend on the velocity u' (docs/concepts/contact.md).
+    """Return the velocity-independent terms of the normal measure, m/s (docs/concepts/contact.md).
+
+    The normal measure at the velocity u' is c = N^T u' + max(phi, 0) / dt + max(min(phi + slop, 0) b / dt, -cap).
 
     Args:
         gaps: phi, m, an array or a tensor of any shape.

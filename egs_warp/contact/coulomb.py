@@ -1,7 +1,8 @@
 """Contact forces with exact Coulomb friction for a given Delassus operator, in one world or in many (Eq. 8, 9).
 
-``coulomb_forces`` solves for one world on the host, ``coulomb_forces_of_worlds`` for many in tensors; where the kernel
-fails, both continue from compliant contacts. ``device_coulomb`` queues the kernel alone on a GPU.
+``coulomb_forces`` solves for one world on the host, ``coulomb_forces_of_worlds`` for many worlds on tensors. If the
+kernel fails, both solve by continuation from compliant contacts. ``device_coulomb`` queues the kernel on a GPU without
+this continuation.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from egs_warp.precision import Vec4, real
 TOLERANCE, MAX_ITERATIONS = 1e-12, 16
 """Residual of the projection equations, m/s, at which Newton's method ends, and its maximum number of steps."""
 FAILURE_TOLERANCE = 1e-8
-"""Residual in m/s above which the solve counts as failed and is repeated by continuation."""
+"""Residual in m/s above which the solve is treated as failed and repeated by continuation."""
 REGULARIZATION_STEPS = (1e-4, 1e-5, 1e-6, 1e-7)
-"""Continuation in the compliance of the contacts: fractions of the mean diagonal of the operator that are added to the
-diagonal, each solve starting from the forces of the one before. With many points on few nodes the operator is nearly
-singular, and most starts do not converge; with compliant contacts they do.
+"""Compliances of the continuation: fractions of the mean diagonal of the operator that are added to its diagonal. Each
+solve starts from the forces of the previous one. With many points on few nodes the operator is nearly singular, and
+Newton's method does not converge from most initial forces; with compliant contacts it does.
 """
 
 DELASSUS_REGULARIZATION = 1e-7
@@ -34,12 +35,13 @@ are more points than the cage can resolve.
 
 
 def regularized(delassus: Any, fraction: float, counts: Any = None, out: Any = None) -> Any:
-    """Add ``fraction`` of the mean of the diagonal to the diagonal.
+    """Return the operator with ``fraction`` of its mean diagonal entry added to its diagonal.
 
     Args:
         delassus: (3n, 3n) of one world, or (B, 3K, 3K), m/(N s).
-        fraction: compliance of the contacts.
-        counts: (B,) number of contacts of each world, which are the terms of its mean; None if all are.
+        fraction: compliance of the contacts, relative to the mean diagonal entry.
+        counts: (B,) number of contacts of each world; the mean is taken over their entries. None takes it over the
+            whole diagonal.
         out: contiguous memory of the result, or None.
     """
     size, out = delassus.shape[-1], empty_like(delassus, delassus.shape) if out is None else out
@@ -54,8 +56,10 @@ def regularized(delassus: Any, fraction: float, counts: Any = None, out: Any = N
 def _continue_from_compliance(
     solve: Callable[[Any, Any], tuple[Any, Any]], delassus: Any, forces: Any, counts: Any = None
 ) -> tuple[Any, Any]:
-    """Solve with less and less compliant contacts, starting from ``forces``; ``solve`` maps an operator and initial
-    forces to forces and their residual. Return those of the operator itself.
+    """Solve with less and less compliant contacts, starting from ``forces``.
+
+    ``solve`` maps an operator and initial forces to forces and their residual. Return the forces and the residual for
+    ``delassus`` itself, without compliance.
     """
     residual = None
     for softness in (*REGULARIZATION_STEPS, 0.0):
@@ -147,18 +151,18 @@ def coulomb_forces_of_worlds(
     frictions: Any,
     start: Any,
 ) -> tuple[Any, Any]:
-    """Compute Coulomb forces of c worlds in tensors, as ``coulomb_forces`` does in one.
+    """Compute the Coulomb forces of c worlds on tensors, by the method of ``coulomb_forces``.
 
     Args:
         counts: (c,) int32, number of contacts of each world.
         delassus: (c, 3K, 3K) m/(N s).
         free_velocity: (c, 3K) m/s without contact forces.
         shift: (c, K) m/s, bias of the normal velocities.
-        frictions: (c,).
+        frictions: (c,) Coulomb coefficients.
         start: (c, K, 3) newtons, initial forces.
 
     Returns:
-        (c, K, 3) newtons and the residuals (c,) in m/s.
+        The forces (c, K, 3) in newtons and the residuals (c,) in m/s.
     """
     worlds, capacity, _ = start.shape
     if worlds == 0 or capacity == 0:
@@ -186,7 +190,7 @@ def _solve_worlds(
     frictions: Any,
     start: Any,
 ) -> tuple[Any, Any]:
-    """Compute the forces with the kernel alone, without continuation."""
+    """Compute the forces with the kernel alone, without continuation (arguments as in ``coulomb_forces_of_worlds``)."""
     worlds, capacity, _ = start.shape
     forces, residual, size = start.clone(), start.new_zeros(worlds), 3 * capacity
     vectors = start.new_empty((worlds, 5, size))
@@ -211,7 +215,7 @@ def enqueue_forces(
         values: operators (c, 3K, 3K) m/(N s), contact velocities without contact forces (c, 3K) m/s, biases (c, K) m/s
             and Coulomb coefficients (c,).
         forces: (c, 3K) newtons, initial forces; overwritten with the solution.
-        scratch: (c, 5, 3K), (c, 2, 3K) int32 and (c, 3K, ceil((3K + 1) / 4), 4).
+        scratch: workspaces (c, 5, 3K), (c, 2, 3K) int32 and (c, 3K, ceil((3K + 1) / 4), 4).
         residual: (c,) m/s, overwritten with the residual of Coulomb's law.
     """
     vectors, indices, matrices = scratch

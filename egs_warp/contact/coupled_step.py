@@ -1,7 +1,8 @@
-"""Newton's method on the velocities and contact forces of one step, until both equations hold (Eq. 4, 8, 9).
+"""Newton's method on the velocities and contact forces of one step (Eq. 4, 8, 9).
 
-A step is solved in rounds with a fixed contact set (``newton_round``). Points that would end a round too deep are added
-to the set, and the next round begins. The iterates come from ``newton`` (host) or ``device_newton`` (GPU).
+It ends when both the equation of motion and Coulomb's law hold. A step is solved in rounds, each with a fixed contact
+set (``newton_round``). Points that would be too deep at the end of a round are added to the set for the next round. The
+iterates come from ``newton`` (host) or ``device_newton`` (GPU).
 """
 
 from __future__ import annotations
@@ -24,10 +25,11 @@ from egs_warp.muscles.tension import MuscleEnergy
 MAX_ACTIVATION_ROUNDS = 6
 """Maximum number of rounds of a step. Points may be added to the contact set after each round except the last."""
 PUSH_OUT_FRACTION = 0.2
-"""Fraction of the depth beyond the tolerance that a step pushes a point out."""
+"""Fraction of the depth beyond the penetration tolerance that a step removes."""
 ACTIVATION_RESIDUAL = 1e-3
-"""Residual divided by dt x weight. When a round first falls below it, the end of the step is accurate enough to add the
-points that would be too deep there. They are also added at the end of the round.
+"""Residual, divided by dt x weight, below which the end of the step is known accurately enough to search for points
+that would be too deep there. They are searched for when the residual of a round first falls below it, and at the end of
+the round.
 """
 COULOMB_TOLERANCE = 1e-6
 """Violation of Coulomb's law at the end of a step, as a fraction of dt g, the speed that free fall gains in a step."""
@@ -38,7 +40,7 @@ class CoupledResult:
     """Result of a step with contact."""
 
     velocities: np.ndarray
-    """(N, 3) m/s."""
+    """(N, 3) m/s, at the end of the step."""
     contacts: ContactSet
     forces: np.ndarray
     """(n, 3) newtons on the body: normal and two tangential components for each contact."""
@@ -65,15 +67,17 @@ class NewtonOptions:
     push_out_cap: float
     """Maximum push-out speed, m/s."""
     penetration_tolerance: float
-    """Metres. Points that would end deeper than ``ACTIVATION_DEPTH`` of it are added to the contact set."""
+    """Tolerated penetration, m. Points that would end the step deeper than the fraction ``ACTIVATION_DEPTH`` of it are
+    added to the contact set.
+    """
     tolerance: float = 1e-8
     """Residual divided by dt x weight at which the solve ends."""
 
     def normal_bias(self, contacts: ContactSet, dt: float) -> Any:
         """Return the velocity bias added to each contact's normal velocity.
 
-        It forbids further penetration during the step and pushes contacts that are deeper than
-        ``penetration_tolerance`` out at a limited speed.
+        It forbids further penetration during the step. Contacts that are deeper than ``penetration_tolerance`` are
+        pushed out at a limited speed.
 
         Args:
             contacts: active contacts.
@@ -133,7 +137,7 @@ class CoupledSolver(NewtonOptions):
         )
 
     def with_penetrating_points(self, end: NewtonIterate) -> ContactSet | None:
-        """Return the contacts of ``end`` and the points that would be too deep there; None if there are none."""
+        """Return the contacts of ``end``, extended by the points that are too deep at ``end``; None if no point is."""
         problem, contacts = end.linearization.tangent.problem, end.linearization.contacts
         check, start = end.penetration, problem.state.positions
         if check is not None and not check.is_penetrating:
@@ -151,14 +155,14 @@ class CoupledSolver(NewtonOptions):
 
 
 _WORLD = (0,)
-"""The set of the only world."""
+"""Set that contains the only world, index 0."""
 
 
 class _OneRound:
     """``NewtonWorlds`` of one world; a set of worlds is ``_WORLD`` or empty."""
 
     def __init__(self, solver: CoupledSolver, start: NewtonIterate, *, last: bool) -> None:
-        """Start a round at ``start``, in which no points are added if it is the ``last``."""
+        """Start a round at the iterate ``start``; the ``last`` round adds no points."""
         response, self._solver, self._is_active = start.linearization, solver, True
         self.iterate, self._steps = start, NewtonStepResult(start, start.forces, 0.0, start)
         self.factorization_count, self.converged = 0, False
@@ -175,13 +179,15 @@ class _OneRound:
         return _WORLD if self._is_active and self.progress.has(bits) else ()
 
     def take_step(self, worlds: tuple[int, ...]) -> None:
-        """Judge the trial at the end of a full Newton step; a GPU makes accepted steps until one needs the host."""
+        """Take a full Newton step and judge its trial. A GPU takes further steps until one needs a decision of the
+        host; all but the last are accepted.
+        """
         friction = self._solver.detector.geometry.friction
         self._steps = self.iterate.newton_steps(self._normal_bias, friction, self.progress)
         self._accept(self._steps.trial)
 
     def halve_step(self, worlds: tuple[int, ...]) -> None:
-        """Judge the trial at the reduced length."""
+        """Evaluate and judge the trial at the reduced step length."""
         trial = self._steps.base.line_search_point(self._steps.forces, self.progress.length)
         self.progress.judge(trial.residual_norm, self._steps.coulomb_violation)
         self._accept(trial)
@@ -194,7 +200,7 @@ class _OneRound:
         self._is_active, self.converged = not self.progress.has(bits), self.progress.has(ENDED)
 
     def check_penetration(self, worlds: tuple[int, ...]) -> None:
-        """End the round if points must be added to the contacts."""
+        """End the round if the contacts must be extended by penetrating points."""
         self.added_contacts = self._solver.with_penetrating_points(self.iterate)
         self._is_active = self.added_contacts is None
 

@@ -39,16 +39,16 @@ MIN_OUTSIDE_FRACTION = 0.1
 _BISECTIONS = 40
 """Bisection steps that shorten an arm to uneven ground."""
 _HULL_BULGE = 1e-7
-"""Relative outward shift of a tetrahedron's points before the hull is computed. It is far above double rounding and
-far below what would make another point of the grid a vertex.
+"""Relative outward shift of a tetrahedron's points before the hull is computed. It is far above double rounding and far
+below the shift that would turn another point of the grid into a vertex.
 """
 _CACHED_CONFIGURATIONS = 4
 """Number of configurations whose gaps are cached. The gaps at the start and the end of a step are requested several
 times, and a step ends where the next one starts.
 """
 _SLACK_FRACTION = 0.25
-"""Fraction of the grid spacing. A point that is less than this below a plane counts as a point of the plane, where
-rounding to the grid places it.
+"""Depth below a plane, as a fraction of the grid spacing, up to which a point is treated as lying on the plane, because
+rounding to the grid places it there.
 """
 _SQUARE_FRACTION = 0.5
 """Side of a square, in spacings of uneven ground. In each square the lowest point of each tetrahedron is retained."""
@@ -67,9 +67,9 @@ class ContactGeometry:
     weights: np.ndarray
     """(P, 4) float64, barycentric weights in the tetrahedron (Eq. 2)."""
     excluded_count: int
-    """Gaussians whose mean lies below a plane at rest."""
+    """Number of Gaussians whose mean lies below the ground or another plane, or inside a solid, at rest."""
     excluded_opacity: float
-    """Their fraction of the total opacity."""
+    """Fraction of the total opacity that belongs to the excluded Gaussians."""
     solid_from_plane: tuple[int, ...] = ()
     """Index of the solid that each plane belongs to, in ascending order. If empty, each plane is a half space."""
     field: HeightField | None = None
@@ -112,12 +112,12 @@ def contact_geometry(
         solids: further obstacles.
         friction: Coulomb coefficient.
         gamma: length of the arms in standard deviations.
-        grid: spacing in metres to which points are rounded, after which they are sorted. The same body read from
-            another file, with other rounding, then has nearly the same points.
+        grid: spacing in metres of the grid to which points are rounded before they are sorted. The points then hardly
+            depend on the rounding of the numbers in the input file. None leaves the points as they are.
         device: device on which the points are embedded.
 
     Raises:
-        ArgumentError: for a solid that contains the body.
+        ArgumentError: if fewer than ``MIN_OUTSIDE_FRACTION`` of the Gaussians above the ground lie outside all solids.
     """
     means = cloud.means.numpy().astype(np.float64)
     quaternions = cloud.rotations.numpy().astype(np.float64)
@@ -125,7 +125,7 @@ def contact_geometry(
     arms = gamma * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :] * axes
     obstacles = [Solid((plane,)) for plane in planes] + list(solids)
     grounds = planes if field is None else (field, *planes[1:])
-    # Many points of a flat base lie in the plane up to rounding; they do not count as below it.
+    # Many points of a flat base lie in the plane up to rounding; they are not treated as below it.
     slack = 0.0 if grid is None else _SLACK_FRACTION * grid
     above = np.all([ground.heights(means) >= -slack for ground in grounds], axis=0)
     least = MIN_OUTSIDE_FRACTION * np.count_nonzero(above)
@@ -176,8 +176,8 @@ def contact_geometry(
 
 
 def _fraction_above(field: HeightField, means: np.ndarray, arms: np.ndarray) -> np.ndarray:
-    """Return (n,), the fraction of each of the ``arms`` (n, 3) that stays above the ground; the ``means`` (n, 3) are
-    above it.
+    """Return (n,), the fraction of each of the ``arms`` (n, 3) that stays above the ground. The arms start at the
+    ``means`` (n, 3), which are above it.
     """
     low, high = np.zeros(len(arms)), np.ones(len(arms))
     low = np.where(field.heights(means + arms) >= 0.0, 1.0, low)
@@ -219,8 +219,8 @@ def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int)
 
 def _bulge(places: np.ndarray) -> np.ndarray:
     """Return the scaled offsets of ``places`` (n, 3) from their mean, lengthened slightly more the longer they are.
-    A point on an edge or face of the hull then lies strictly inside (|p|^2 is convex) and a vertex remains a
-    vertex; otherwise rounding would decide.
+    Points on an edge or face of the hull then lie strictly inside it, because |p|^2 is convex, and vertices remain
+    vertices. Without the bulge, rounding would decide which points are vertices.
     """
     arms = places - places.mean(axis=0)
     arms /= max(float(np.abs(arms).max()), 1e-300)
@@ -228,7 +228,7 @@ def _bulge(places: np.ndarray) -> np.ndarray:
 
 
 class ContactDetector:
-    """Evaluates the gaps of all points and builds contacts, in one world or in many."""
+    """Detector that evaluates the gaps of all points and builds contact sets, in one world or in many."""
 
     def __init__(self, geometry: ContactGeometry, *, device: str | None = None) -> None:
         self.geometry = geometry
@@ -263,7 +263,7 @@ class ContactDetector:
     def gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Evaluate the gaps of all points; the result is cached and read-only.
 
-        The distance to a solid is the largest signed distance to its faces. The distance to uneven ground is that of
+        The distance to a solid is the largest signed distance to its faces. The distance to uneven ground is defined by
         ``HeightField.gaps``.
 
         Args:
@@ -302,8 +302,8 @@ class ContactDetector:
             launch_cached(ground_gaps_kernel, gaps.shape, inputs=inputs, outputs=[gaps, faces], device=self.device)
 
     def points_within(self, positions: np.ndarray, distance: float) -> np.ndarray:
-        """Return the positions (k, 3) of the contact points closer than ``distance`` metres to an obstacle at
-        ``positions`` (N, 3).
+        """Return (k, 3) m, the positions of the contact points that are closer than ``distance`` metres to an obstacle
+        when the nodes are at ``positions`` (N, 3) m.
         """
         near = np.flatnonzero(self.gaps(positions)[0] < distance)
         nodes = self.geometry.mesh.tets[self.geometry.tet_from_point[near]]
@@ -313,8 +313,8 @@ class ContactDetector:
         """Write the record of contacts on the device, asynchronously.
 
         Args:
-            inputs: ``points`` (B, K) and ``counts`` (B,); at the start of the step, ``positions`` (B, N), and ``gaps``
-                and ``faces`` of all points (B, P).
+            inputs: ``points`` (B, K) and ``counts`` (B,); ``positions`` (B, N) m of the nodes at the start of the step;
+                ``gaps`` (B, P) m and ``faces`` (B, P) of all points there.
             outputs: ``nodes``, ``weights``, ``axes``, ``gaps`` and ``faces`` (B, K), as in ``ContactSet``.
         """
         launch_cached(
@@ -338,13 +338,13 @@ class ContactDetector:
         return gaps, faces
 
     def contact_sets(self, points: Any, counts: Any, positions: Any, start: Sequence[Any]) -> ContactSet:
-        """Return the contacts of c worlds as tensors on the device; this blocks until the device has finished.
+        """Return the contacts of c worlds as tensors on the device. Blocks until ``counts`` is known on the host.
 
         Args:
-            points: (c, L) int32, points, of which each world uses its first ``counts`` (c,).
-            counts: int32.
+            points: (c, L) int32, contact points; each world uses the first ``counts`` entries.
+            counts: (c,) int32, number of contacts of each world.
             positions: (c, N, 3) m, at the start of the step.
-            start: gaps (c, P) m and faces (c, P) there.
+            start: gaps (c, P) m and faces (c, P) int32 of all points at ``positions``.
         """
         capacity = int(counts.max()) if len(counts) else 0
         points = points[:, :capacity].contiguous()
@@ -357,7 +357,7 @@ class ContactDetector:
         return ContactSet(points, nodes, weights, axes, gaps, faces, positions.shape[1], counts)
 
     def contact_set(self, points: np.ndarray, positions: np.ndarray) -> ContactSet:
-        """Return the contact set of ``points`` (n,); ``positions`` (N, 3) at the start of the step."""
+        """Return the contact set of ``points`` (n,) for nodal ``positions`` (N, 3) m at the start of the step."""
         self.gaps(positions)
         found, count = self._last_gaps, len(points)
         assert found is not None
@@ -372,7 +372,7 @@ class ContactDetector:
 
 
 class _PointGaps:
-    """Gaps of all points of one world at some positions, on the device and, read-only, on the host."""
+    """Gaps of all points of one world in one configuration, on the device and, read-only, on the host."""
 
     def __init__(self, count: int, device: wp.Device, *, has_one_face: bool) -> None:
         self.gaps, self.faces = zeros((1, count), real, device), zeros((1, count), int, device)
@@ -382,7 +382,7 @@ class _PointGaps:
         self.on_host: tuple[np.ndarray, np.ndarray] = np.zeros(count), faces
 
     def download(self) -> None:
-        """Copy the result to new arrays on the host; with one face, its index is always 0."""
+        """Copy the gaps and faces to new arrays on the host. If there is only one face, all face indices are 0."""
         values = [values[0] for values in PinnedMirror.get_all(*self._mirrors)]
         for each in values:
             each.flags.writeable = False
@@ -390,7 +390,7 @@ class _PointGaps:
 
 
 class _RecordBuffers:
-    """Record of up to ``capacity`` contacts of one world."""
+    """Buffers for the record of up to ``capacity`` contacts of one world."""
 
     def __init__(self, capacity: int, device: wp.Device) -> None:
         self.capacity = capacity
@@ -409,7 +409,7 @@ class _RecordBuffers:
         self._host_counts.put(np.array([len(points)]))
 
     def read(self, count: int) -> list[np.ndarray]:
-        """Return copies of the arrays after ``points`` of the first ``count`` contacts."""
+        """Return copies of nodes, weights, axes, gaps and faces of the first ``count`` contacts."""
         return [values[0, :count] for values in PinnedMirror.get_all(*self._host_arrays)]
 
 

@@ -29,12 +29,12 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy
 
 _CAPACITY_STEP = 8
-"""Contact capacities are multiples of this. Each capacity has buffers and graphs of its own."""
+"""Contact capacities are multiples of this. Each capacity has separate buffers and graphs."""
 
 
 class DeviceContactLinearizer(StepWorkspace, ContactLinearizer):
-    """Builds contact linearisations with the dense factors of one body on the device of its elements. Only the last
-    linearisation, ``current``, can be used.
+    """Builder of the contact linearisations of one body with dense factors, on the device that holds its elements. Only
+    the last linearisation, ``current``, can be used.
     """
 
     is_on_host = False
@@ -117,14 +117,14 @@ class DeviceContactLinearization(ContactLinearization):
         return self.workspace.download_delassus()[:width, :width]
 
     def with_added_contacts(self, contacts: ContactSet) -> DeviceContactLinearization:
-        """Return the linearisation of ``contacts``, of which the first are the current ones, with the same tangent."""
+        """Return the linearisation of ``contacts``, which begin with the current ones, with the same tangent."""
         return self.owner(self.tangent, contacts)
 
     def iterate_at(
         self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> DeviceNewtonIterate:
-        """Return the Newton iterate at ``velocities`` (N, 3) and contact ``forces`` (n, 3), under ``tension``. An
-        iterate at these arrays that the workspace already holds is reused.
+        """Return the Newton iterate at ``velocities`` (N, 3) m/s and contact ``forces`` (n, 3) newtons, under
+        ``tension``. If the workspace already holds the iterate of these array objects, it is reused.
         """
         for iterate in (self.workspace.trial_iterate, self.workspace.pending_iterate):
             if iterate is not None and iterate.is_at(self, tension, velocities, forces):
@@ -181,7 +181,7 @@ class DeviceContactLinearization(ContactLinearization):
             tension: muscle energy, or None.
             forces: (n, 3) newtons.
             size: norm of the residual, N s.
-            speeds: (3K,) m/s, contact-free velocities of the contacts.
+            speeds: (3K,) m/s, contact velocities after a Newton step without contact forces.
             velocities: (3N,) m/s.
             penetration: penetration test, or None.
         """
@@ -209,11 +209,11 @@ class DeviceNewtonIterate:
         self._tangent_pending = False
 
     def set_values(self, size: float, speeds: np.ndarray, penetration: PenetrationCheck | None) -> None:
-        """Set the values that were downloaded.
+        """Set the downloaded values.
 
         Args:
             size: norm of the residual, divided by dt x weight.
-            speeds: (3K,) m/s, contact-free velocities of the contacts.
+            speeds: (3K,) m/s, contact velocities after a Newton step without contact forces.
             penetration: penetration test, or None.
         """
         self._residual_norm, self._penetration = size, penetration
@@ -285,8 +285,8 @@ class DeviceNewtonIterate:
     ) -> NewtonStepResult:
         """Run the Newton loop on the device and block until it ends (arguments as in ``NewtonIterate``).
 
-        A loop that is already queued from this iterate with the same parameters is used. Without ``progress`` one step
-        is taken. If the Coulomb solve of the last step failed, it is repeated on the host.
+        If a loop from this iterate with the same parameters is already queued, its result is used. Without
+        ``progress``, one step is taken. If the Coulomb solve of the last step failed, it is repeated on the host.
         """
         response, workspace = self.linearization, self.linearization.workspace
         owner, problem, count = response.owner, response.tangent.problem, response.contacts.count
@@ -299,7 +299,7 @@ class DeviceNewtonIterate:
         ):
             base = self._slot()
             if base == FROM_BASE and workspace.trial_iterate is not None:
-                # The contact velocities in the buffer are those of the trial.
+                # The buffer holds the contact velocities of the trial.
                 workspace.reevaluate(base=base)
             if self._residual_norm is not None:
                 progress.begin(self._residual_norm)
@@ -337,8 +337,8 @@ class DeviceNewtonIterate:
         return NewtonStepResult(first, forces, violation, end)
 
     def with_new_tangent(self) -> DeviceNewtonIterate:
-        """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles. It
-        is queued asynchronously, and its linearisation becomes ``current``.
+        """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles. The
+        tangent is queued asynchronously, and its linearisation becomes ``current``.
         """
         old, owner, workspace = self.linearization, self.linearization.owner, self.linearization.workspace
         assert owner.current is old
@@ -377,8 +377,8 @@ class DeviceNewtonIterate:
         self.set_values(size, workspace.readback.free_contact_velocities, penetration)
 
     def _wait_tangent(self) -> None:
-        """Block until a queued tangent is factored. If it is not positive definite, compute another one: the sum with
-        the muscles' stiffness may be positive definite where the first part alone is not.
+        """Block until a queued tangent is factored. If it is not positive definite, compute the tangent again with
+        ``StepProblem.tangent``, which falls back to a positive definite approximation.
         """
         if not self._tangent_pending:
             return

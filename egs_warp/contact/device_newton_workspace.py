@@ -1,13 +1,14 @@
-"""Buffers and CUDA graphs of a step with contact on a GPU, where a round of Newton steps is one loop on the device.
+"""Buffers and CUDA graphs of a step with contact on a GPU. A round of Newton steps is one loop on the device.
 
-Trials are those of ``trial``; the rule of the loop is ``kernels/contact/newton_convergence.py``. One vector holds an
-iterate (see ``NewtonWorkspace.parts``). There are two, base and trial, and a start buffer that the host fills.
+Trials are evaluated by ``contact/trial.py``; the kernels in ``kernels/contact/newton_convergence.py`` control the loop.
+One vector holds an iterate (see ``NewtonWorkspace.parts``). The workspace has two of them, base and trial, and a start
+buffer that the host fills.
 
-A Newton loop is three graphs. ``_enqueue_loop_start`` copies the row of ``NewtonProgress`` and sets the loop condition.
-``_enqueue_next_step`` is the loop body: it solves Coulomb's law at the contact-free velocities of the last trial, makes
-that trial the base, takes the full Newton step to a new trial, evaluates the residual, the contact-free velocities and
-the penetration test there, and judges the trial. ``_enqueue_end`` prefetches the contacts of the next step and starts
-the download.
+A Newton loop consists of three graphs. ``_enqueue_loop_start`` copies the row of ``NewtonProgress`` and sets the loop
+condition. ``_enqueue_next_step`` is the loop body: it solves Coulomb's law at the contact-free velocities of the last
+trial, makes that trial the base, takes the full Newton step to a new trial, evaluates the residual, the contact-free
+velocities and the penetration test there, and judges the trial. ``_enqueue_end`` prefetches the contacts of the next
+step and starts the download.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.precision import Vec3, real
 
 FROM_BASE, FROM_TRIAL, FROM_START = 0.0, 1.0, 2.0
-"""Slot that a trial starts from: the base as it is, the last trial, or the start buffer."""
+"""Slot that a trial starts from: the unchanged base, the last trial, or the start buffer."""
 _FULL_STEP = (1.0, 1.0, FROM_TRIAL)
-"""Packed input of a full Newton step from the last trial: length, use of the contact forces, slot."""
+"""Packed input of a full Newton step from the last trial: step length, 1 if contact forces act (else 0), slot."""
 
 
 class TrialReadback(NamedTuple):
@@ -48,7 +49,7 @@ class TrialReadback(NamedTuple):
     free_contact_velocities: np.ndarray
     """(3K,) m/s, contact velocities after a Newton step from the trial without contact forces."""
     velocities: np.ndarray
-    """(3N,) m/s."""
+    """(3N,) m/s, velocities of the trial."""
     coulomb_violation: np.ndarray
     """(1,) m/s, residual of the last Coulomb solve."""
     forces: np.ndarray
@@ -58,11 +59,11 @@ class TrialReadback(NamedTuple):
     progress: np.ndarray
     """(ROW_SIZE,) row of ``NewtonProgress`` after the loop."""
     previous_contact_velocities: np.ndarray
-    """(3K,) m/s, contact-free velocities of the contacts at the start of the last step. ``velocities_before`` (3N,)
-    m/s and ``forces_before`` (3K,) newtons belong to the same iterate.
-    """
+    """(3K,) m/s, ``free_contact_velocities`` of the iterate at the start of the last step."""
     velocities_before: np.ndarray
+    """(3N,) m/s, velocities of that iterate."""
     forces_before: np.ndarray
+    """(3K,) newtons, contact forces of that iterate."""
 
 
 class NewtonWorkspace:
@@ -82,7 +83,7 @@ class NewtonWorkspace:
             *(self._points[None], nodes.view(1, -1, 4), weights.view(1, -1, 4), axes.view(1, -1, 3, 3), None, None),
             *(self._node_count, torch.full((1,), capacity, dtype=torch.int32, device=count.device)),
         )
-        """The uploaded contacts of one world. Padding has zero weights and counts as contacts."""
+        """Uploaded contacts of one world. Padding entries have zero weights and are included in ``counts``."""
         self.columns = owner.zeros(size, width)
         self._right, self.delassus = owner.zeros(size, 3 + width), owner.zeros(width, width)
         self._host_delassus = owner.stream.pinned(width * width)
@@ -105,7 +106,7 @@ class NewtonWorkspace:
         penetration, self._progress, self._previous_contact_velocities, *self._previous_iterate = others
         self._penetrating_count, self._min_gap, self._internal_torque = penetration.split([1, 1, 3])
         self.readback = TrialReadback(*np.split(self._host_readback.numpy(), np.cumsum(parts)[:-1]))
-        # Newton loop: row of progress, loop condition, event at its end.
+        # State of the Newton loop: row of progress, loop condition, event at the end.
         self._progress_upload = PinnedUpload(owner.stream, convergence_kernels.ROW_SIZE)
         self._loop_condition, self._always_enabled = (
             torch.full((1,), each, dtype=torch.int32, device=count.device) for each in (0, 1)
@@ -114,8 +115,8 @@ class NewtonWorkspace:
         self.coulomb = CoulombWorkspace(owner.stream, capacity, count)
         self._start_upload = PinnedUpload(owner.stream, 3 * size + width + owner.segment_count)
         self.start_buffer, self.tensions = self._start_upload.device.split([3 * size + width, owner.segment_count])
-        """Iterate that a trial can start from, with the layout of the base. ``tensions`` are newtons of the muscle
-        segments.
+        """Iterate that a trial can start from, in the layout of ``parts``. ``tensions`` are the tensions of the muscle
+        segments in newtons.
         """
         self._tensions = as_warp(self.tensions, real)
         self._base, self._trial = owner.zeros(3 * size + width), owner.zeros(3 * size + width)
@@ -140,7 +141,7 @@ class NewtonWorkspace:
         """(ROW_SIZE,) row of progress with which the last loop was started."""
 
     def trial_parts(self) -> Any:
-        """Return the ``parts`` of the last trial."""
+        """Return the last trial, split as in ``parts``."""
         return self.parts(self._trial)
 
     def contact_velocities(self, velocities: torch.Tensor) -> torch.Tensor:
@@ -153,8 +154,8 @@ class NewtonWorkspace:
         self._run(self.enqueue_linearization, problem.dt, problem.inertia_ratio)
 
     def download_delassus(self) -> np.ndarray:
-        """Return the (3K, 3K) m/(N s) Delassus operator that ``linearize`` has downloaded. The caller synchronises
-        first.
+        """Return the Delassus operator, (3K, 3K) m/(N s), that ``linearize`` has downloaded. The caller must
+        synchronise first.
         """
         return self._host_delassus.numpy().reshape(3 * self.capacity, -1).copy()
 
@@ -243,8 +244,13 @@ class NewtonWorkspace:
     def run_trial(
         self, problem: StepProblem, *, length: float, target_forces: np.ndarray, base: float
     ) -> TrialReadback:
-        """Evaluate a trial at the fraction ``length`` of the Newton step with contact forces ``target_forces`` (n,
-        3) from the slot ``base``, and block until it is evaluated.
+        """Evaluate a trial and block until it is evaluated.
+
+        Args:
+            problem: the step.
+            length: fraction of the Newton step.
+            target_forces: (n, 3) newtons, contact forces of the full Newton step.
+            base: slot to start from, ``FROM_BASE``, ``FROM_TRIAL`` or ``FROM_START``.
         """
         self._upload_trial(length, True, target_forces, base)
         return self._run_and_download(self._enqueue_trial, problem.dt, problem.inertia_ratio)
@@ -349,8 +355,8 @@ class NewtonWorkspace:
         self._internal_torque.copy_(self._torque)
 
     def enqueue_newton(self, dt: float, ratio: float) -> None:
-        """Solve Coulomb's law, starting from ``target_forces``, and run the trial in ``trial_input`` with the
-        solution.
+        """Solve Coulomb's law, starting from ``target_forces``, and evaluate the trial that ``trial_input`` describes
+        with the solution.
         """
         self.coulomb.enqueue_forces(self.free_contact_velocities, self.target_forces, self.coulomb_violation)
         self._solved_forces.copy_(self.target_forces)
@@ -364,8 +370,8 @@ class NewtonWorkspace:
         self._trial_upload.host[2] = base
 
     def reevaluate(self, *, base: float) -> None:
-        """Recompute the contact-free velocities of the contacts at the slot ``base`` with the current linearisation,
-        asynchronously. Other values in the read-back belong to another trial.
+        """Recompute ``free_contact_velocities`` of the iterate in the slot ``base`` with the current linearisation,
+        asynchronously. The other values in the read-back still belong to the last trial.
         """
         with self.owner.stream:
             self._set_base(base)
@@ -382,8 +388,8 @@ class NewtonWorkspace:
         Args:
             problem: the step.
             tension: muscle energy whose stiffness is added, or None.
-            velocities: (N, 3) m/s, at the slot.
-            base: slot at which the tangent is computed.
+            velocities: (N, 3) m/s, velocities of the iterate in ``base``.
+            base: slot of the iterate at which the tangent is computed.
         """
         owner, ratio = self.owner, problem.inertia_ratio
         with owner.stream:
@@ -433,8 +439,8 @@ class NewtonWorkspace:
         self._host_readback.copy_(self._packed_readback, non_blocking=True)
 
     def _enqueue_newton(self, state: torch.Tensor) -> None:
-        """Solve for the velocities after a Newton step without contact forces from ``state``, and for those of the
-        contacts.
+        """Compute the nodal velocities after a Newton step without contact forces from ``state``, and the contact
+        velocities there.
         """
         velocities, free_velocities, residual, _ = self.parts(state)
         self._enqueue_free_velocities(velocities, residual, free_velocities)
@@ -468,7 +474,9 @@ class NewtonWorkspace:
         self._start_download()
 
     def enqueue_prediction(self, dt: float, ratio: float) -> None:
-        """Queue ``predict_velocities`` from the trial in ``trial_input``. ``ratio`` is 1 + dt drag."""
+        """Queue the Newton step of ``predict_velocities`` from the trial that ``trial_input`` describes. ``ratio`` is 1
+        + dt drag.
+        """
         owner, factors = self.owner, self.owner.factors
         self._indices.copy_(self._packed_indices)
         momenta = self._right[:, :3]
@@ -490,8 +498,8 @@ class NewtonWorkspace:
         self._start_download()
 
     def enqueue_trial(self, dt: float, ratio: float) -> None:
-        """Run the trial in ``trial_input``: the residual there, and the Newton step without contact forces from
-        there.
+        """Evaluate the trial that ``trial_input`` describes: its residual, and the Newton step from it without contact
+        forces.
         """
         self.enqueue_residual(dt, ratio)
         torch.linalg.vector_norm(self._residual, out=self.residual_norm[0])
@@ -499,7 +507,7 @@ class NewtonWorkspace:
         self._enqueue_newton(self._trial)
 
     def enqueue_residual(self, dt: float, ratio: float) -> None:
-        """Compute the velocities, forces and residual of the trial in ``trial_input``."""
+        """Compute the velocities, forces and residual of the trial that ``trial_input`` describes."""
         owner = self.owner
         self._enqueue_base()
         torch.mv(self.columns, self.target_forces, out=self._force_velocities)

@@ -1,7 +1,7 @@
-"""Start and matrix of a body's step on a GPU: buffers, factorisation and prefetch of contacts.
+"""Start and system matrix of a step of one body on a GPU: buffers, factorisation and prefetch of contacts.
 
-The kernel is in ``kernels/fem/step_start.py``. ``DeviceContactLinearizer`` in ``device_newton`` adds the
-linearisations to ``StepWorkspace``.
+The kernels of the start are in ``kernels/fem/step_start.py``. ``DeviceContactLinearizer`` in ``device_newton`` extends
+``StepWorkspace`` by the contact linearisations.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from egs_warp.precision import Mat33, Vec3
 _CAPACITY_STEP = 64
 """Capacities for rank-one terms of the muscles' stiffness are multiples of this."""
 _SIGNS = (1.0, -1.0)
-"""Signs of the low-rank updates. The negative one comes last."""
+"""Signs of the low-rank updates. The update with the negative sign is applied last."""
 
 
 @dataclass(frozen=True)
@@ -39,25 +39,32 @@ class SolveEnd:
     """End of the last solve, from which the next step may continue."""
 
     velocities: np.ndarray
-    """(N, 3) m/s, at the end of a step of ``dt`` seconds."""
+    """(N, 3) m/s, at the end of the step."""
     dt: float
+    """Step size, s."""
     points: np.ndarray
-    """(n,) contact points of the solve; ``capacity`` is the contact capacity K of its workspace."""
+    """(n,) contact points of the solve."""
     loaded: np.ndarray
     """(n,) bool, True for points that carry load."""
     capacity: int
+    """Contact capacity K of the workspace of the solve."""
 
     def capacity_if_continued(self, state: BodyState, dt: float, points: np.ndarray, loaded: np.ndarray) -> int | None:
-        """Return the capacity if a step of ``dt`` seconds from ``state``, with the previous contact points ``points``
-        of which those ``loaded`` (n,) carry load, continues from this end; None otherwise.
+        """Return the contact capacity if the next step continues from this end, else None.
+
+        Args:
+            state: start of the next step.
+            dt: its step size, s.
+            points: (n,) contact points of the previous step.
+            loaded: (n,) bool, True for points that carried load.
         """
         same = self.velocities is state.velocities and self.points is points and self.dt == dt
         return self.capacity if same and np.array_equal(self.loaded, loaded) else None
 
 
 class StepWorkspace:
-    """Buffers of a step of one body with dense ``factors``, on the device of its elements: start, matrix and
-    momentum projection.
+    """Buffers for the start, the system matrix and the momentum projection of a step of one body with dense
+    ``factors``, on the device that holds its elements.
     """
 
     def __init__(self, factors: TiledCholesky, body: SoftBody, muscles: MuscleSet, prefetch: ContactPrefetch) -> None:
@@ -85,17 +92,19 @@ class StepWorkspace:
         self._loaded_step: tuple[BodyState, float] | None = None
         """State and step size in seconds of the loaded step."""
         self._prefetch_points: tuple[np.ndarray, np.ndarray] | None = None
-        """(m,) contact points of the previous step for which a prefetch is in flight, and (m,) bool, which of them
-        carried load.
+        """Arguments of the prefetch in flight: (m,) contact points of the previous step, and (m,) bool, True for points
+        that carried load.
         """
         self.last_solve: SolveEnd | None = None
-        """End of the last solve. The contacts of a step that continues from it are already prefetched."""
+        """End of the last solve. If the next step continues from it, its contacts are already prefetched."""
         self._prefetch_capacity: int | None = None
-        """Contact capacity of the solve that prefetched the contacts; None if ``ContactPrefetch.start`` did."""
+        """Contact capacity of the solve that prefetched the contacts; None if ``ContactPrefetch.start`` prefetched
+        them.
+        """
         self.predicted_start: Any = None
-        """Start of the step for which a plan is in flight; None after any other work."""
+        """Start of the step for which a plan is in flight; None if the buffers have been used otherwise since."""
         self.gaps_of: StepProblem | None = None
-        """Step whose gaps at the start ``prefetch`` holds."""
+        """Step whose initial gaps ``prefetch`` holds."""
 
     def zeros(self, *shape: int) -> torch.Tensor:
         """Return a float64 tensor of zeros on the device."""
@@ -106,7 +115,7 @@ class StepWorkspace:
         return torch.as_tensor(np.ascontiguousarray(values, dtype=np.float64), device=self.factors.device)
 
     def set_problem(self, problem: StepProblem) -> None:
-        """Load the start of ``problem``, unless it is loaded."""
+        """Load the start of ``problem``, unless it is already loaded."""
         self._load(problem.state, problem.dt)
 
     def _load(self, state: BodyState, dt: float) -> None:
@@ -130,8 +139,13 @@ class StepWorkspace:
         self._enqueue_ballistic(self.positions, self.velocities, dt, self.ballistic)
 
     def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray, loaded: np.ndarray) -> None:
-        """Start ``select_contacts`` for a step of ``dt`` seconds from ``state``, asynchronously; ``before`` (m,) are
-        the contact points of the step that ends there, and ``loaded`` (m,) is True for those that carry load.
+        """Start ``select_contacts`` for the step of ``dt`` seconds from ``state``, asynchronously.
+
+        Args:
+            state: start of the step.
+            dt: step size, s.
+            before: (m,) contact points of the previous step.
+            loaded: (m,) bool, True for points that carried load.
         """
         with self.stream:
             self._cancel_prefetch()
@@ -169,8 +183,14 @@ class StepWorkspace:
             self.stream.wait()
 
     def enqueue_prefetch(self, ends: torch.Tensor, velocities: torch.Tensor, dt: float, *before: torch.Tensor) -> None:
-        """Queue the selection for a step from ``ends`` (3N,) at ``velocities`` (3N,), given the contact points
-        ``before`` it: (K,) int32, their number (1,) int32 and their normal forces (K,) newtons.
+        """Queue the contact selection for the next step.
+
+        Args:
+            ends: (3N,) m, positions at the start of the next step.
+            velocities: (3N,) m/s, velocities there.
+            dt: step size, s.
+            before: contact points (K,) int32 of the current step, their number (1,) int32 and their normal forces (K,)
+                newtons.
         """
         self._enqueue_ballistic(ends, velocities, dt, self._next_ballistic)
         self.prefetch.enqueue_next((self._ends[0], vectors(ends)), vectors(self._next_ballistic), *before)
@@ -182,18 +202,19 @@ class StepWorkspace:
         ballistic.mul_(dt).add_(positions)
 
     def enqueue_factors(self, ends: wp.array, dt: float) -> None:
-        """Factor the matrix of the step at the positions ``ends``, without muscles."""
+        """Factor the system matrix of the step at the end positions ``ends`` (N,), without muscles."""
         entries = self.elements.enqueue_entries(ends, self.gradients, dt, factor=dt**2, projected=False)
         self.factors.enqueue_factor(wp.to_torch(entries)[0])
 
     def enqueue_stiffness(self, problem: StepProblem, tension: MuscleEnergy, velocities: np.ndarray) -> None:
-        """Add the stiffness of the muscles under ``tension``, at the end positions that ``velocities`` (N, 3) lead to,
-        to the factored matrix.
+        """Add the stiffness of the muscles under ``tension`` to the factored matrix. It is evaluated at the end
+        positions for the velocities ``velocities`` (N, 3) m/s.
         """
         segments, directions, rates = tension.hessian(problem.end_positions(velocities)).rank_one_terms(
             min_relative_stiffness=MIN_RELATIVE_STIFFNESS
         )
-        # Terms with positive stiffness are added, negative ones subtracted. Zero rows of padding change nothing.
+        # Terms of positive stiffness are added, terms of negative stiffness subtracted. Padding rows are zero and
+        # change nothing.
         terms_by_sign = {sign: np.flatnonzero(sign * rates > 0.0) for sign in _SIGNS}
         packed = [np.zeros((round_up(len(terms), _CAPACITY_STEP), 4)) for terms in terms_by_sign.values()]
         for terms, part in zip(terms_by_sign.values(), packed, strict=True):
@@ -207,7 +228,7 @@ class StepWorkspace:
         self._graphs.run((capacities, signs), lambda: self._enqueue_low_rank_updates(capacities, signs))
 
     def _enqueue_low_rank_updates(self, capacities: tuple[int, ...], signs: tuple[float, ...]) -> None:
-        """Add the uploaded rank-one terms with these ``signs``; ``capacities`` has the number of rows of each sign."""
+        """Add the uploaded rank-one terms with these ``signs``; ``capacities`` are the row counts for +1 and -1."""
         parts = self._directions_upload.device[: 4 * sum(capacities)].view(-1, 4).split(capacities)
         for sign, part in zip(_SIGNS, parts, strict=True):
             if sign in signs:

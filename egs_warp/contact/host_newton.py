@@ -1,4 +1,4 @@
-"""Newton steps with contact on a CPU, in one or two kernel launches instead of twenty NumPy calls (Eq. 4, 8).
+"""Newton steps with contact on a CPU, in one or two kernel launches each (Eq. 4, 8).
 
 The kernels are in ``kernels/contact/iterate_cpu.py``. ``HostNewtonWorkspace.trial`` moves an iterate along a Newton
 step and evaluates the residual there; ``HostNewtonWorkspace.newton`` solves for the next contact-free velocities.
@@ -20,8 +20,8 @@ from egs_warp.precision import real
 
 
 class IterateBuffer:
-    """Data of a Newton iterate in one block of memory, since looking up an array's address takes longer than using
-    it.
+    """Data of a Newton iterate in one block of memory. Only one address has to be looked up, which takes longer in
+    NumPy than the computation with the array.
     """
 
     def __init__(self, contacts: ContactSet) -> None:
@@ -52,17 +52,17 @@ class IterateBuffer:
 
     @property
     def velocities(self) -> np.ndarray:
-        """(N, 3) m/s."""
+        """(N, 3) m/s, nodal velocities."""
         return self._all[: self._ends[0]].reshape(-1, 3)
 
     @property
     def free_velocities(self) -> np.ndarray:
-        """(N, 3) m/s after a Newton step without contact forces."""
+        """(N, 3) m/s, nodal velocities after a Newton step without contact forces."""
         return self._all[self._ends[0] : self._ends[1]].reshape(-1, 3)
 
     @property
     def forces(self) -> np.ndarray:
-        """(n, 3) newtons."""
+        """(n, 3) newtons, contact forces."""
         return self._all[self._ends[2] : self._ends[3]].reshape(-1, 3)
 
     @property
@@ -72,7 +72,7 @@ class IterateBuffer:
 
 
 class HostNewtonWorkspace:
-    """Buffers of a step of a body with ``nodes`` nodes. The data of the last step and contact set stay loaded."""
+    """Buffers for the step of a body with ``nodes`` nodes. The data of the last step stay loaded."""
 
     def __init__(self, nodes: int) -> None:
         self._device = wp.get_device("cpu")
@@ -113,7 +113,7 @@ class HostNewtonWorkspace:
                 step to take; None evaluates ``base`` itself.
 
         Returns:
-            The state there, and the norm of the residual divided by dt x weight.
+            The evaluated iterate, and the norm of its residual, divided by dt x weight.
         """
         self._load(problem)
         assembly = problem.body.assembly
@@ -151,8 +151,8 @@ class HostNewtonWorkspace:
         Args:
             tangent: factored tangent.
             state: the iterate.
-            rest: if True, use the residual of the last trial, which includes contact forces, instead of that of
-                ``state``.
+            rest: if True, use the residual of the last trial, which includes contact forces, instead of the
+                contact-free residual in ``state``.
         """
         factors = tangent.factors
         assert isinstance(factors, MultifrontalLdl)

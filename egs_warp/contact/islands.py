@@ -1,4 +1,4 @@
-"""Islands: the sets of bodies that contacts between them connect; each is solved by itself."""
+"""Islands: sets of bodies that are connected by contacts. The contact forces of different islands are independent."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ def enqueue_islands(counts: wp.array, pairs: wp.array, islands: wp.array) -> Non
 
     Args:
         counts: (B,) int, number of contacts.
-        pairs: (B, K) vec2i, bodies of each contact; a negative one is an obstacle.
-        islands: (B, nbody) int, overwritten with the lowest body of each body's island.
+        pairs: (B, K) vec2i, the two bodies of each contact; a negative index is an obstacle.
+        islands: (B, nbody) int, overwritten with the lowest body index in each body's island.
     """
     launch_cached(islands_kernel, len(islands), inputs=[counts, pairs], outputs=[islands], device=device_of(islands))
 
 
 def find_islands(body_count: int, pairs: np.ndarray) -> np.ndarray:
-    """Return (body_count,), the lowest body of each body's island, in one world.
+    """Return (body_count,), the lowest body index in each body's island, for one world.
 
     Args:
         body_count: number of bodies.
-        pairs: (n, 2) int, bodies of each contact; a negative one is an obstacle.
+        pairs: (n, 2) int, the two bodies of each contact; a negative index is an obstacle.
     """
     if len(pairs) == 0:
         return np.arange(body_count)

@@ -66,14 +66,14 @@ class ContactLinearization:
             start: (n, 3) newtons, initial forces.
 
         Returns:
-            The forces (n, 3) in newtons, and their violation of the law in m/s.
+            The forces (n, 3) in newtons, and their violation of Coulomb's law in m/s.
         """
         if self.contacts.count == 0:
             return start, 0.0
         return coulomb_forces(self._regular, speeds, shift, friction, start)
 
     def with_added_contacts(self, contacts: ContactSet) -> ContactLinearization:
-        """Return the linearisation of ``contacts``, of which the first are the current ones, with the same tangent."""
+        """Return the linearisation of ``contacts``, which begin with the current ones, with the same tangent."""
         new = contacts.jacobian_transposed()[:, 3 * self.contacts.count :]
         columns = np.hstack([self.columns, self.tangent.problem.dt * self.tangent.solve(new)])
         return ContactLinearization.of(self.tangent, contacts, columns)
@@ -85,7 +85,7 @@ class ContactLinearization:
 
 class ContactLinearizer:
     """Builder of the contact linearisations of one body, with NumPy arrays on the host. ``DeviceContactLinearizer`` is
-    the one on a GPU.
+    the builder for a GPU.
     """
 
     is_on_host = True
@@ -96,7 +96,7 @@ class ContactLinearizer:
         return ContactLinearization.of(tangent, contacts)
 
     def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
-        """Select the contacts of a step where the gaps are on a GPU.
+        """Select the contacts of a step if the gaps are on a GPU.
 
         Args:
             problem: the step.
@@ -109,9 +109,13 @@ class ContactLinearizer:
         return None
 
     def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray, loaded: np.ndarray) -> None:
-        """Start ``select_contacts`` for the probable next step, of ``dt`` seconds from ``state``, if the gaps are on a
-        GPU; ``before`` (m,) are the contact points of the step that ends there, and ``loaded`` (m,) is True for those
-        that carry load.
+        """Start ``select_contacts`` for the probable next step if the gaps are on a GPU.
+
+        Args:
+            state: start of the next step.
+            dt: step size, s.
+            before: (m,) contact points of the step before it.
+            loaded: (m,) bool, True for points that carried load.
         """
 
     def predict_velocities(
@@ -122,8 +126,8 @@ class ContactLinearizer:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> np.ndarray | None:
-        """Take one Newton step with fixed contact forces. This needs one right-hand side; a linearisation needs three
-        for each contact.
+        """Take one Newton step with fixed contact forces. Only one right-hand side has to be solved, while a
+        linearisation solves three for each contact.
 
         Args:
             tangent: factored tangent.
@@ -151,7 +155,7 @@ class PenetrationCheck:
     min_gap: float
     """Minimum gap of all points, m."""
     internal_torque: np.ndarray
-    """(3,) N m, torque of the internal gradient about the centre of mass at the end."""
+    """(3,) N m, torque of the internal gradient about the centre of mass at the end of the step."""
     deepest: ContactSet | None = None
     """Deepest penetrating point of each cell, the deepest first; None if it was not downloaded."""
 
@@ -162,9 +166,7 @@ class PenetrationCheck:
 
 
 class NewtonIterate(Protocol):
-    """Protocol of a Newton iterate: velocities and contact forces, the residual there, and the Newton step from
-    there.
-    """
+    """Protocol of a Newton iterate: velocities and contact forces, their residual, and the Newton step from them."""
 
     @property
     def linearization(self) -> ContactLinearization:
@@ -173,12 +175,12 @@ class NewtonIterate(Protocol):
 
     @property
     def velocities(self) -> np.ndarray:
-        """(N, 3) m/s."""
+        """(N, 3) m/s, nodal velocities at the end of the step."""
         ...
 
     @property
     def forces(self) -> np.ndarray:
-        """(n, 3) newtons."""
+        """(n, 3) newtons, contact forces."""
         ...
 
     @property
@@ -208,15 +210,15 @@ class NewtonIterate(Protocol):
     def newton_steps(
         self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
     ) -> NewtonStepResult:
-        """Take Newton steps, each with the contact forces that satisfy Coulomb's law at its contact-free velocities.
+        """Take Newton steps. The contact forces of each satisfy Coulomb's law for its contact-free velocities.
 
-        Without ``progress``, and on the host, it is one step. A GPU takes steps until one needs the host; all but the
-        last are accepted.
+        On the host, or without ``progress``, one step is taken. A GPU takes steps until one needs a decision of the
+        host; all but the last are accepted.
 
         Args:
             shift: (n,) m/s, bias of the normal velocities.
             friction: Coulomb coefficient.
-            progress: progress of the round; the last step is judged by it.
+            progress: progress of the round, which judges the last step.
         """
         ...
 
@@ -236,6 +238,7 @@ class NewtonStepResult:
     coulomb_violation: float
     """Violation of Coulomb's law by these forces, m/s."""
     trial: NewtonIterate
+    """Iterate at the end of the last step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,12 +261,12 @@ class NativeNewtonIterate:
 
     @property
     def velocities(self) -> np.ndarray:
-        """(N, 3) m/s."""
+        """(N, 3) m/s, nodal velocities at the end of the step."""
         return self.state.velocities
 
     @property
     def forces(self) -> np.ndarray:
-        """(n, 3) newtons."""
+        """(n, 3) newtons, contact forces."""
         return self.state.forces
 
     @property
@@ -273,7 +276,7 @@ class NativeNewtonIterate:
 
     @cached_property
     def _after(self) -> IterateBuffer:
-        """The state, with the contact-free velocities of the Newton step filled in."""
+        """``state``, after the contact-free velocities of the Newton step have been computed in it."""
         _workspace_of(self.linearization).newton(self.linearization.tangent, self.state)
         return self.state
 

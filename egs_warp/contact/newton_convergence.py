@@ -1,7 +1,7 @@
 """Progress of Newton's method with contact in one world (Eq. 4, 8).
 
-The rule is a kernel, ``kernels/contact/newton_convergence.py``, which also judges the steps of the loop on a GPU and of
-many worlds (``batch_step``); here it runs on a CPU.
+The kernel in ``kernels/contact/newton_convergence.py`` judges the steps. This module runs it on a CPU; the loop on a
+GPU and the steps of many worlds (``batch_step``) use the same kernel.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class NewtonProgress:
             tolerance: residual at which the round ends.
             activation_residual: residual below which points that penetrate too far are first searched for; they are
                 searched for again at the end. Negative values disable both searches.
-            coulomb_tolerance: largest violation of Coulomb's law, m/s.
-            max_steps: number of steps of the round after which a loop on a GPU returns to the host.
+            coulomb_tolerance: maximum violation of Coulomb's law, m/s.
+            max_steps: number of steps of the round at which a loop on a GPU returns to the host.
         """
         self.row = np.full(kernels.ROW_SIZE, -1.0)
-        """(ROW_SIZE,) the columns that ``kernels/contact/newton_convergence.py`` lists."""
+        """(ROW_SIZE,) row of progress, with the columns listed in ``kernels/contact/newton_convergence.py``."""
         self.row[: kernels.RECENT_RESIDUALS] = 0.0
         self.row[[kernels.RESIDUAL, kernels.PREVIOUS_RESIDUAL]] = -1.0
         self.row[[kernels.LENGTH, kernels.UNIT]] = 1.0
@@ -47,7 +47,7 @@ class NewtonProgress:
 
     @property
     def steps(self) -> int:
-        """Number of steps that were judged."""
+        """Number of completed Newton steps of the round."""
         return int(self.row[kernels.STEPS])
 
     @property
@@ -65,7 +65,7 @@ class NewtonProgress:
         return bool(int(self.row[kernels.OUTCOME]) & bits)
 
     def begin(self, residual: float) -> None:
-        """Set the ``residual`` at the start of the next step, unless it is known."""
+        """Set the ``residual`` at the start of the next step, unless it is already known."""
         if self.row[kernels.RESIDUAL] < 0.0:
             self.row[kernels.RESIDUAL] = residual
 
@@ -73,7 +73,7 @@ class NewtonProgress:
         """Judge a trial.
 
         Args:
-            residual: residual there; not finite where an element is inverted.
+            residual: residual of the trial; not finite where an element is inverted.
             violation: violation of Coulomb's law by its forces, m/s.
         """
         values, arrays = _buffers(kernels.ROW_SIZE)
@@ -83,7 +83,7 @@ class NewtonProgress:
         self.row[:] = values[3:]
 
     def take(self, row: np.ndarray) -> bool:
-        """Take over the ``row`` (ROW_SIZE,) of a loop on a GPU, and return True if the loop made only one trial."""
+        """Copy the ``row`` (ROW_SIZE,) from a loop on a GPU; return True if the loop evaluated only one trial."""
         before = self.steps
         self.row[:] = row
         self.row[kernels.UNIT] = 1.0
@@ -91,13 +91,13 @@ class NewtonProgress:
         return self.steps - before + undecided == 1
 
     def renew_tangent(self) -> None:
-        """Record that the tangent is that of the present velocities."""
+        """Record that the tangent was computed at the current velocities."""
         self.row[kernels.TANGENT_IS_CURRENT] = 1.0
 
 
 @thread_local_cache(1)
 def _buffers(columns: int) -> tuple[np.ndarray, list[wp.array]]:
-    """Return memory for the three inputs of ``judge_steps_kernel`` and a row of progress, and the kernel's arrays."""
+    """Return memory for three inputs of ``judge_steps_kernel`` and a row of progress, and Warp arrays that share it."""
     values = np.zeros(3 + columns)
     parts = [values[k : k + 1] for k in range(3)]
     inputs = [wp.array(part, dtype=real, device="cpu", copy=False) for part in parts]

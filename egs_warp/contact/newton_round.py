@@ -1,11 +1,11 @@
 """One round of Newton's method on velocities and contact forces with fixed contacts, in one world or in many (Eq. 4, 8,
 9).
 
-``run_round`` is the iteration. A world takes a full Newton step, whose contact forces satisfy Coulomb's law at the
-velocities without them, and halves it until the rule of ``newton_convergence`` accepts it. Then it may have ended or
-failed, points outside the contact set may penetrate too far, which ends the round so that they can be added, or the
-tangent may have to be renewed. ``NewtonWorlds`` is what the iteration needs: ``coupled_step`` implements it for one
-world on the host or on a GPU, ``batch_step`` for many.
+``run_round`` is the iteration. A world takes a full Newton step, whose contact forces satisfy Coulomb's law for its
+contact-free velocities, and halves it until the rule of ``newton_convergence`` accepts it. The round then ends if it
+has converged or failed, or if points outside the contact set penetrate too far and must be added. Otherwise the tangent
+is renewed if necessary, and the next step follows. ``coupled_step`` implements the protocol ``NewtonWorlds`` for one
+world on the host or on a GPU, ``batch_step`` for many worlds.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class NewtonWorlds(Protocol):
         ...
 
     def take_step(self, worlds: Any) -> None:
-        """Judge the trial at the end of a Newton step in each of the ``worlds``, and accept it if it is good."""
+        """Take a full Newton step in each of the ``worlds``, judge its trial, and make it the iterate if accepted."""
         ...
 
     def halve_step(self, worlds: Any) -> None:
-        """Judge the trial at the reduced length of the last step in each of the ``worlds``."""
+        """Judge the trial at the reduced length of the last Newton step in each of the ``worlds``."""
         ...
 
     def stop(self, bits: int) -> None:
@@ -40,11 +40,13 @@ class NewtonWorlds(Protocol):
         ...
 
     def check_penetration(self, worlds: Any) -> None:
-        """End the round of those of the ``worlds`` in which points must be added to the contacts."""
+        """End the round of each of the ``worlds`` whose contacts must be extended by penetrating points."""
         ...
 
     def renew_tangent(self, worlds: Any) -> None:
-        """Factor and linearise the ``worlds`` at their velocities, and end the round of those without factors."""
+        """Factor the tangents of the ``worlds`` at their velocities and linearise their contacts. End the round of
+        worlds whose tangent cannot be factored.
+        """
         ...
 
 

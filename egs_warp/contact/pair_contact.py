@@ -1,4 +1,4 @@
-"""Contacts between bodies: the contact points of each against the level sets of the others.
+"""Contacts between bodies: the contact points of each body against the level sets of the other bodies.
 
 ``PairContactDetector`` finds the pairs of bodies that may touch in a step, selects contact points with the
 ``ContactSelector`` of each body, and builds a two-sided ``PairContactSet``. The mathematics is in
@@ -24,18 +24,19 @@ from egs_warp.precision import Mat33, Vec3, Vec4, real
 from egs_warp.short_repr import short_repr
 
 BODY_INFLATION = 1.0
-"""Inflation of the box of each body, in its activation distances."""
+"""Inflation of the bounding box of each body, in multiples of its activation distance."""
 TET_INFLATION = 2.0
-"""Inflation of the boxes of the tetrahedra, in activation distances: a selected point is dropped at this gap. Parts of
-a body that are further outside of its cage cannot be touched, because elements extrapolate badly.
+"""Inflation of the bounding boxes of the tetrahedra, in multiples of the activation distance. It equals the gap at
+which a selected point is dropped. Parts of a body that are further outside its cage cannot be touched, because elements
+extrapolate badly.
 """
 _STRETCH = 1.01
-"""Bound of the stretch of a prop, whose single tetrahedron extrapolates exactly."""
+"""Upper bound of the stretch of a prop. A prop has a single tetrahedron, which extrapolates exactly."""
 
 
 @dataclass(frozen=True)
 class PairBody:
-    """A body as contact with other bodies needs it."""
+    """Data of a body that contact with other bodies needs."""
 
     __repr__ = short_repr
 
@@ -49,18 +50,18 @@ class PairBody:
 
 @dataclass(frozen=True, eq=False)
 class PairContactSet:
-    """n contacts between bodies, sorted by key. Contact velocities are those of body a less those of body b."""
+    """n contacts between bodies, sorted by key. Contact velocities are the velocities of body a relative to body b."""
 
     keys: np.ndarray
     """(n, 3) int: body a, body b, contact point of body a."""
     nodes: np.ndarray
     """(n, 2, 4) int, nodes of body a and of body b, in the numbering of all bodies."""
     weights: np.ndarray
-    """(n, 2, 4) float64, weights of the point of body a in its tetrahedron and in that of body b, each of sum 1."""
+    """(n, 2, 4) float64, barycentric weights of the contact point in the tetrahedra of body a and of body b, sum 1."""
     axes: np.ndarray
     """(n, 3, 3), contact frames: the rows are the unit normal, from b to a, and two unit tangents."""
     gaps: np.ndarray
-    """(n,) m, at the start of the step."""
+    """(n,) m, signed distance at the start of the step."""
     node_count: int
     """Number N of nodes of all bodies."""
 
@@ -71,8 +72,8 @@ class PairContactSet:
 
     @cached_property
     def jacobian(self) -> sparse.csr_matrix:
-        """Sparse (3n, 3N) contact Jacobian W: the rows of a contact are its axes, weighted on the nodes of body a, and
-        with the opposite sign on those of body b.
+        """Sparse (3n, 3N) contact Jacobian W. The rows of a contact are its axes times the weights, with positive sign
+        at the nodes of body a and negative sign at the nodes of body b.
         """
         signed = self.weights * np.array([[1.0], [-1.0]])
         entries = self.axes[:, :, None, None, :] * signed[:, None, :, :, None]
@@ -85,7 +86,7 @@ class PairContactSet:
 class PairContactDetector:
     """Detector of the contacts between the bodies of one world.
 
-    The nodes of the bodies are concatenated: those of body i begin at ``node_starts[i]``.
+    The nodes of the bodies are concatenated; the nodes of body i begin at ``node_starts[i]``.
     """
 
     def __init__(self, bodies: Sequence[PairBody], *, device: str | None = None) -> None:
@@ -118,7 +119,7 @@ class PairContactDetector:
         Args:
             end_positions: (N, 3) m, at the predicted end of the step.
             previous: contacts of the previous step.
-            loaded: (m,) bool, True for those of ``previous`` that carried load.
+            loaded: (m,) bool, True for contacts of ``previous`` that carried load.
 
         Returns:
             (n, 3) int, keys in ascending order.
@@ -143,7 +144,9 @@ class PairContactDetector:
         return self._gaps(a, b)
 
     def contact_set(self, keys: np.ndarray, positions: np.ndarray) -> PairContactSet:
-        """Return the contacts with ``keys`` (n, 3) from ``select``; ``positions`` (N, 3) at the start of the step."""
+        """Return the contacts with the ``keys`` (n, 3) from ``select``, for nodal ``positions`` (N, 3) m at the start
+        of the step.
+        """
         keys = np.asarray(keys, int).reshape(-1, 3)
         self._place(positions, set(keys[:, :2].ravel().tolist()))
         starts, changes = np.unique(keys[:, :2], axis=0, return_index=True)
@@ -219,7 +222,7 @@ class _DeformedBody:
         self._hierarchy.refit()
 
     def tets_of(self, other: int) -> wp.array:
-        """Return the buffer (1, P) for the tetrahedron of body ``other`` at each point, -1 at first."""
+        """Return the buffer (1, P) for the tetrahedron of body ``other`` at each point, initially -1."""
         if other not in self._tets_of:
             self._tets_of[other] = wp.full(self.gaps.shape, -1, dtype=int, device=self.device)
         return self._tets_of[other]
@@ -236,8 +239,8 @@ class _DeformedBody:
 
 
 def _protrusion(body: PairBody) -> float:
-    """Return an upper bound of the distance (m) of the contact points of a prop from its tetrahedron; 0 for a cage of
-    several tetrahedra, which encloses the body.
+    """Return an upper bound, in metres, of the distance between the contact points of a prop and its tetrahedron. It is
+    0 for a cage of several tetrahedra, which encloses the body.
     """
     mesh, weights = body.geometry.mesh, body.geometry.weights
     if len(mesh.tets) > 1:

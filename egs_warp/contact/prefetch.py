@@ -1,4 +1,4 @@
-"""Contacts of a step that are selected on a GPU while the host still works on the step before (Eq. 8).
+"""Selection of the contacts of a step on a GPU while the host still works on the previous step (Eq. 8).
 
 Gaps, selection and contact records stay on the device until one download brings them to the host.
 """
@@ -22,7 +22,9 @@ from egs_warp.precision import Mat33, Vec4, real
 _CAPACITY_STEP = 64
 """Capacities for points of the previous step are multiples of this."""
 _RECORD_SIZE = 17
-"""Size of a contact's record in float64: axes 9, weights 4, gap 1; six integers, two in each: nodes 4, face, point."""
+"""Size of a contact's record in float64 values: 9 for the axes, 4 for the weights, 1 for the gap, and 3 that hold two
+int32 each, for 4 nodes, the face and the point.
+"""
 
 
 class ContactPrefetch:
@@ -39,7 +41,7 @@ class ContactPrefetch:
             detector: gaps of the points.
             selector: selection of the points, on the same device.
             stream: stream on which the work is queued.
-            penetration_tolerance: that of ``CoupledSolver``, m.
+            penetration_tolerance: ``CoupledSolver.penetration_tolerance``, m.
         """
         self._detector, self._selector, self._stream = detector, selector, stream
         self._tolerance = penetration_tolerance
@@ -57,11 +59,11 @@ class ContactPrefetch:
         self._graphs = GraphCache(stream)
 
     def start(self, positions: wp.array, ends: wp.array, before: np.ndarray, loaded: np.ndarray) -> None:
-        """Start the selection for ``contacts``, asynchronously.
+        """Start the contact selection of a step, asynchronously; ``contacts`` returns the result.
 
         Args:
-            positions: (N,) start of the step, on the device.
-            ends: (N,) predicted end of the step.
+            positions: (N,) m, nodes at the start of the step, on the device.
+            ends: (N,) m, nodes at the predicted end of the step.
             before: (m,) contact points of the previous step.
             loaded: (m,) bool, True for points that carried load.
         """
@@ -95,15 +97,15 @@ class ContactPrefetch:
         counts: torch.Tensor,
         loads: torch.Tensor,
     ) -> None:
-        """Queue the selection for the step that follows the current one, after ``enqueue_penetration`` at the end of
-        the current one. ``advance`` makes the result valid.
+        """Queue the contact selection for the next step. It requires that ``enqueue_penetration`` was called for the
+        end of the current step; ``advance`` makes the result valid.
 
         Args:
-            positions: (N,) start and end of the current step.
-            ends: (N,) predicted end of the next step.
+            positions: (N,) m, nodes at the start and at the end of the current step.
+            ends: (N,) m, nodes at the predicted end of the next step.
             points: (K,) int32, contact points of the current step.
             counts: (1,) int32, number of valid ``points``.
-            loads: (K,) newtons, their normal forces.
+            loads: (K,) newtons, normal forces at ``points``.
         """
         buffers = self._buffers_for(len(points))
         buffers.set_previous(points, counts, loads > 0.0)
@@ -118,13 +120,13 @@ class ContactPrefetch:
         self._enqueue_selection(buffers, self._next_gaps, end, self._next_start_gaps, self._next_start_faces)
 
     def advance(self) -> None:
-        """Make the step of ``enqueue_next`` the current one."""
+        """Make the next step of ``enqueue_next`` the current one."""
         for target, values in ((self._start_gaps, self._next_start_gaps), (self._start_faces, self._next_start_faces)):
             wp.to_torch(target).copy_(wp.to_torch(values))
 
     def _enqueue_selection(self, buffers: _TransferBuffers, gaps: wp.array, *start: wp.array) -> None:
-        """Select contacts by the ``gaps`` at the end of the step, write their records from positions, gaps and faces at
-        its ``start``, and start the download.
+        """Select contacts by the ``gaps`` (1, P) at the end of the step, write their records from the positions, gaps
+        and faces at its ``start``, and start the download.
         """
         chosen = buffers.selection
         self._selector.enqueue_selection(buffers.previous, gaps, [self._lowest, buffers.candidates], chosen.selected)
@@ -132,14 +134,14 @@ class ContactPrefetch:
         buffers.download()
 
     def contacts(self, capacity: int) -> ContactSet:
-        """Return the contacts of the step, those of ``ContactSelector.select``, after their download; ``capacity`` is
-        the number of points of the previous step in ``start``, or that of ``points`` in ``enqueue_next``.
+        """Return the contacts of the step after their download, with the points that ``ContactSelector.select`` would
+        select. ``capacity`` is the length of ``before`` in ``start``, or of ``points`` in ``enqueue_next``.
         """
         return self._buffers_for(capacity).selection.contact_set(len(self._detector.geometry.mesh.nodes))
 
     def deepest(self, capacity: int) -> ContactSet:
-        """Return the deepest penetrating point of each cell, the deepest first, in the step that was the current one
-        at ``enqueue_next`` with ``capacity`` points.
+        """Return the deepest penetrating point of each cell, sorted by depth, deepest first, for the step that was
+        current when ``enqueue_next`` was called with ``capacity`` points.
         """
         return self._buffers_for(capacity).deepest.contact_set(len(self._detector.geometry.mesh.nodes))
 
@@ -149,10 +151,10 @@ class ContactPrefetch:
         """Count the points that penetrate too far at the end of the current step.
 
         Args:
-            ends: (N,) end positions.
+            ends: (N,) m, nodes at the end of the step.
             points: (K,) int32, contact points of the step, which are not counted.
             counts: (1,) int32, number of valid ``points``.
-            count: (1,), overwritten with the number.
+            count: (1,) float64, overwritten with the number of penetrating points.
         """
         self._detector.enqueue_gaps(ends.reshape((1, -1)), self._gaps, self._faces)
         count.zero_()
@@ -185,7 +187,7 @@ class _TransferBuffers:
         self.selection, self.deepest = (_ContactRecords(*part) for part in parts)
 
     def set_previous(self, points: torch.Tensor, counts: torch.Tensor, loaded: torch.Tensor) -> None:
-        """Copy ``points`` (m,) of the previous step, their number (1,) and whether they are ``loaded`` (m,)."""
+        """Copy ``points`` (m,) of the previous step, their number ``counts`` (1,) and their flags ``loaded`` (m,)."""
         self._points[0, : len(points)].copy_(points)
         self._counts.copy_(counts)
         self._loaded[0, : len(loaded)].copy_(loaded)

@@ -24,12 +24,12 @@ there.
 _MIN_SPACING = 0.4
 """Minimum spacing of the cells in mean edge lengths of the cage, so that small feet stand on several cells."""
 GAP_TOLERANCE_FRACTION = 1e-7
-"""Gap tolerance as a fraction of the activation distance. Of points whose gaps are equal within it, the one closest
-to the centre of the cell is selected. A flat sole is flat only to rounding, and rounding would select different
+"""Gap tolerance as a fraction of the activation distance. Of points whose gaps are equal within it, the one closest to
+the centre of the cell is selected. Without it, rounding errors in the points of a flat sole would select different
 points on different machines.
 """
 ACTIVATION_DEPTH = 0.6
-"""Depth beyond which a point is added to the contact set if it would end there, as a fraction of the penetration
+"""Depth at the end of a step beyond which a point is added to the contact set, as a fraction of the penetration
 tolerance.
 """
 MAX_SINK = 0.3
@@ -49,9 +49,9 @@ class ContactSelector:
     A point without load is also dropped if its cell has a clearly lower point. Without this hysteresis points would
     alternate, and the load would oscillate.
 
-    Points that would end a step too deep are added in the step: those deeper than ``ACTIVATION_DEPTH`` of the
-    penetration tolerance that have sunk by more than ``MAX_SINK`` of it (``MAX_CREEP`` if they are deeper than the
-    tolerance), again only the lowest of each cell.
+    During a step, points that would be too deep at its end are added: points that would be deeper than
+    ``ACTIVATION_DEPTH`` of the penetration tolerance and would sink by more than ``MAX_SINK`` of it (by more than
+    ``MAX_CREEP`` if they would be deeper than the tolerance). Again only the lowest point of each cell is added.
     """
 
     def __init__(
@@ -92,12 +92,12 @@ class ContactSelector:
         self._buffers: _SelectionBuffers | None = None
 
     def enqueue_lowest(self, gaps: wp.array, near: float, lowest: wp.array) -> None:
-        """Find the lowest point of each cell with a gap below ``near`` metres, -1 if there is none, asynchronously.
+        """Find the lowest point of each cell, asynchronously.
 
         Args:
             gaps: (B, P) m.
-            near: m.
-            lowest: (B, C) int, overwritten.
+            near: maximum gap of the points, m.
+            lowest: (B, C) int, overwritten with the lowest point of each cell, -1 if none has a gap below ``near``.
         """
         inputs = [self._order, self._bounds, near, self.gap_tolerance, gaps]
         self._launch(kernels.lowest_point_per_cell_kernel, (*lowest.shape, self._lanes), inputs, [lowest])
@@ -108,7 +108,7 @@ class ContactSelector:
         """Select the points of the next step, in ascending order, asynchronously.
 
         Args:
-            previous: points (B, L) of the previous step, their counts (B,), and (B, L) int, 1 for those that carried
+            previous: points (B, L) of the previous step, their counts (B,), and (B, L) int, 1 for points that carried
                 load.
             gaps: (B, P) m, at the predicted end of the step.
             work: workspaces (B, C) int and (B, L + C) int.
@@ -126,26 +126,26 @@ class ContactSelector:
         tolerance: float,
         penetrating: Sequence[wp.array],
     ) -> None:
-        """Find the points that would end a step too deep and are no contacts, asynchronously.
+        """Find the points that would be too deep at the end of a step and are not contacts, asynchronously.
 
         Args:
             contacts: points (B, K) and counts (B,).
             gaps: (B, P) m, at the end and at the start of the step.
             tolerance: penetration tolerance, m.
-            penetrating: (B,), increased by the number of such points, and (B, C) int, overwritten with the deepest of
-                each cell, -1 if there is none.
+            penetrating: (B,), increased by the number of such points, and (B, C) int, overwritten with the deepest such
+                point of each cell, -1 if there is none.
         """
         inputs = [self._order, self._bounds, self.gap_tolerance, ACTIVATION_DEPTH * tolerance, tolerance]
         inputs += [MAX_SINK, MAX_CREEP, *contacts, *gaps]
         self._launch(kernels.penetrating_points_kernel, (*penetrating[1].shape, self._lanes), inputs, penetrating)
 
     def enqueue_append(self, lowest: wp.array, gaps: wp.array, contacts: Sequence[wp.array]) -> None:
-        """Append points to contacts, those with the smallest gaps first, asynchronously.
+        """Append points to contacts in ascending order of their gaps, asynchronously.
 
         Args:
-            lowest: (B, C) int, points that are no contacts, or -1.
-            gaps: (B, P) m, by which they are sorted.
-            contacts: points (B, K) and counts (B,), extended; K must suffice.
+            lowest: (B, C) int, points that are not contacts yet, or -1.
+            gaps: (B, P) m, gaps of all points.
+            contacts: points (B, K) and counts (B,), extended. K must be large enough.
         """
         inputs = [self.gap_tolerance, lowest, gaps]
         self._launch(kernels.append_points_kernel, (len(lowest), self._lanes), inputs, contacts)
@@ -176,14 +176,16 @@ class ContactSelector:
     def find_penetrating(
         self, points: np.ndarray, gaps: np.ndarray, start_gaps: np.ndarray, tolerance: float
     ) -> np.ndarray:
-        """Return (k,), the deepest point of each cell that would end too deep and is not in ``points`` (n,), the
-        deepest first.
+        """Find the points that would be too deep at the end of a step and are not contacts.
 
         Args:
             points: (n,) contact points of the step.
             gaps: (P,) m, at the end of the step.
-            start_gaps: (P,) m.
+            start_gaps: (P,) m, at the start of the step.
             tolerance: penetration tolerance, m.
+
+        Returns:
+            (k,) the deepest such point of each cell, sorted by depth, deepest first.
         """
         buffers = self._buffers_for(len(points))
         buffers.write(points, np.zeros(len(points), bool))
@@ -204,7 +206,7 @@ class ContactSelector:
         """Select the points of the next step in c worlds; all arrays are tensors on the device.
 
         Args:
-            previous: points (c, L) int32 of the previous step, their counts (c,) int32, and (c, L) int32, 1 for those
+            previous: points (c, L) int32 of the previous step, their counts (c,) int32, and (c, L) int32, 1 for points
                 that carried load.
             gaps: (c, P) m, at the predicted end of the step.
 
@@ -220,8 +222,15 @@ class ContactSelector:
         return points, counts
 
     def find_penetrating_in_worlds(self, contacts: ContactSet, gaps: Sequence[Any], tolerance: float) -> Any:
-        """Return (c, C) int32, the deepest point of each cell that would end too deep and is not in ``contacts``, or
-        -1; ``gaps`` (c, P) m at the end and at the start of the step, penetration ``tolerance`` m.
+        """Find the points that would be too deep at the end of a step and are not contacts, in c worlds.
+
+        Args:
+            contacts: contacts of the step.
+            gaps: (c, P) m, at the end and at the start of the step.
+            tolerance: penetration tolerance, m.
+
+        Returns:
+            (c, C) int32, the deepest such point of each cell, or -1.
         """
         found = gaps[0].new_zeros(len(contacts.counts))
         lowest = contacts.counts[:, None].repeat(1, self.cell_count)
@@ -231,8 +240,15 @@ class ContactSelector:
         return lowest
 
     def append_in_worlds(self, contacts: ContactSet, lowest: Any, gaps: Any) -> tuple[Any, Any]:
-        """Append the points in ``lowest`` (c, C) that are not negative, those with the smallest ``gaps`` (c, P) in
-        metres first; return the points (c, K) and their counts (c,). There is at least one world.
+        """Append points to the contacts of c >= 1 worlds, in ascending order of their gaps.
+
+        Args:
+            contacts: contacts of the worlds.
+            lowest: (c, C) int32, points to append; -1 appends nothing.
+            gaps: (c, P) m, gaps of all points.
+
+        Returns:
+            The points (c, K) and their counts (c,).
         """
         points, counts = padded(contacts.points, self.cell_count), contacts.counts.clone()
         inputs = as_warp(lowest.contiguous(), wp.int32), as_warp(gaps.contiguous(), real)
@@ -263,7 +279,7 @@ class _SelectionBuffers:
         self._padded = np.zeros((2, 1, capacity), np.int32)
 
     def write(self, points: np.ndarray, loaded: np.ndarray) -> None:
-        """Upload ``points`` (m,) of the previous step, and whether they are ``loaded`` (m,)."""
+        """Upload ``points`` (m,) of the previous step and the flags ``loaded`` (m,), True if they carried load."""
         for target, values in zip(self._padded, (points, loaded), strict=True):
             target[0, : len(values)] = values
         for mirror, values in zip(

@@ -23,8 +23,8 @@ class Surface(Protocol):
     """Protocol of the surfaces that a body can stand on: ``Solid`` and ``HeightField``."""
 
     def distance_along(self, point: np.ndarray, up: np.ndarray) -> float:
-        """Return the signed distance along ``up`` (3,) from ``point`` (3,) to the top of the surface; -inf if it is
-        not above or below the point.
+        """Return the signed distance along ``up`` (3,) from ``point`` (3,) to the top of the surface; -inf if the line
+        through the point does not meet the surface.
         """
         ...
 
@@ -43,8 +43,8 @@ class Solid:
         return Solid(tuple(face.scaled(factor) for face in self.faces))
 
     def distance_along(self, point: np.ndarray, up: np.ndarray) -> float:
-        """Return the signed distance along ``up`` (3,) from ``point`` (3,) to the top of the solid; -inf if it is
-        not above or below the point.
+        """Return the signed distance along ``up`` (3,) from ``point`` (3,) to the top of the solid; -inf if the line
+        through the point does not meet the solid, or the solid has no top.
         """
         low, high = -np.inf, np.inf
         for face in self.faces:
@@ -59,7 +59,7 @@ class Solid:
 
 
 def step(ground: Plane, edge: np.ndarray, forward: np.ndarray, height: float) -> Solid:
-    """Create a step that extends without limit.
+    """Create a stair step that extends without limit behind its edge.
 
     Args:
         ground: ground plane.
@@ -78,7 +78,7 @@ def read_terrain(path: Path) -> tuple[Solid, ...]:
     A point is inside where n.x + d < 0 for every face.
 
     Raises:
-        UserError: for the first malformed entry, with the number of its solid.
+        UserError: the file has no solids or too many faces, or a solid is malformed; the message gives its number.
     """
     entries = parse_json(read_text(path), path)
     if not isinstance(entries, list) or not entries:

@@ -1,8 +1,8 @@
-"""A trial of Newton's method in tensors, in one world on a GPU or in many: a point of a Newton step and the residual
-there (Eq. 4, 8).
+"""Trials of Newton's method on tensors, in one world on a GPU or in many: a point on a Newton step and its residual
+(Eq. 4, 8).
 
-``enqueue_trial`` is the only place where tensors are moved along a Newton step. Its kernels are in
-``kernels/contact/iterate.py``; on a CPU, ``host_newton`` evaluates the trials of one world in a single launch.
+``enqueue_trial`` evaluates them with the kernels in ``kernels/contact/iterate.py``. On a CPU, ``host_newton`` evaluates
+the trials of one world in a single launch.
 """
 
 from __future__ import annotations
@@ -25,17 +25,21 @@ class TrialStep:
     """The steps of c worlds with N nodes (see ``ImplicitStep``)."""
 
     dt: float
+    """Step size, s."""
     inertia_ratio: float
+    """1 + dt drag."""
     gravity: Any
     """Vec3, m/s^2."""
     node_mass: torch.Tensor
-    """(N,) kg."""
+    """(N,) kg, lumped masses."""
     positions: torch.Tensor
-    """(c, N, 3) m, at the start; ``velocities`` (c, N, 3) m/s and ``lever_arms`` (c, N, 3) m there."""
+    """(c, N, 3) m, at the start of the step."""
     velocities: torch.Tensor
+    """(c, N, 3) m/s, at the start of the step."""
     lever_arms: torch.Tensor
+    """(c, N, 3) m, positions relative to the centre of mass at the start of the step."""
     inverse_inertia: torch.Tensor
-    """(c, 3, 3) 1/(kg m^2)."""
+    """(c, 3, 3) 1/(kg m^2), inverse of the inertia tensor."""
     enqueue_internal: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], None]
     """Function of end positions (c, N, 3) that writes the internal gradient (c, N, 3) N and its torque (c, 3) N m."""
 
@@ -49,11 +53,11 @@ class NewtonDirection(BatchedRecord):
     free_velocities: torch.Tensor
     """(c, N, 3) m/s, at the end without contact forces."""
     force_velocities: torch.Tensor
-    """(c, N, 3) m/s, effect of the contact forces at the end."""
+    """(c, N, 3) m/s, difference that the contact forces make at the end."""
     forces: torch.Tensor
     """(c, K, 3) newtons, contact forces at the start."""
     target_forces: torch.Tensor
-    """(c, K, 3) newtons, at the end."""
+    """(c, K, 3) newtons, contact forces at the end."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +65,11 @@ class Trial(BatchedRecord):
     """Result of a trial of c worlds."""
 
     velocities: torch.Tensor
-    """(c, N, 3) m/s."""
+    """(c, N, 3) m/s, at the end of the step."""
     forces: torch.Tensor
-    """(c, K, 3) newtons."""
+    """(c, K, 3) newtons, contact forces."""
     end_positions: torch.Tensor
-    """(c, N, 3) m."""
+    """(c, N, 3) m, at the end of the step."""
     gradient: torch.Tensor
     """(c, N, 3) newtons, internal gradient."""
     torque: torch.Tensor
@@ -77,7 +81,7 @@ class Trial(BatchedRecord):
 
     @classmethod
     def empty(cls, velocities: torch.Tensor, forces: torch.Tensor) -> Trial:
-        """Allocate a trial for velocities and forces of these shapes."""
+        """Allocate a trial whose velocities and forces have the shapes of ``velocities`` and ``forces``."""
         nodal = [torch.empty_like(velocities) for _ in range(5)]
         torque = velocities.new_empty((len(velocities), 3))
         return cls(nodal[0], torch.empty_like(forces), nodal[1], nodal[2], torque, nodal[3], nodal[4])

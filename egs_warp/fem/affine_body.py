@@ -1,8 +1,8 @@
 """Props: stiff bodies that deform affinely, as a soft body of one tetrahedron.
 
-The four nodes have a quarter of the mass each and the second moment of the body, so mass, centre, inertia and the
-kinetic energy of every affine motion are exact. The element has the volume of the body, so the elastic energy of every
-affine deformation is exact too.
+Each of the four nodes has a quarter of the mass, and together they have the second moment of the body. So mass, centre
+of mass, inertia and the kinetic energy of every affine motion are exact. Young's modulus of the element is scaled by
+the ratio of the volumes of body and element, so the elastic energy of every affine deformation is exact too.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PROP_SAG = 1e-5
 _MIN_MOMENT_RATIO = 1e-6
 """Minimum ratio of the principal second moments of a body that has a volume."""
 _CORNERS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
-"""(4, 3) corners of a regular tetrahedron with the second moment of unit masses equal to 4 I."""
+"""(4, 3) corners of a regular tetrahedron. Unit masses at the corners have the second moment 4 I."""
 _RIGID_MODES = 6
 
 
@@ -34,7 +34,7 @@ class VolumeMoments:
     """Moments of a body of uniform density."""
 
     volume: float
-    """m^3."""
+    """Volume, m^3."""
     centre: np.ndarray
     """(3,) m, centre of mass."""
     second_moment: np.ndarray
@@ -96,7 +96,7 @@ def affine_body(
     damping_ratio: float = 0.05,
     device: str | None = None,
 ) -> SoftBody:
-    """Make a prop: a body of one tetrahedron with the mass, inertia and stiffness of the whole.
+    """Make a prop: a body of one tetrahedron with the mass, the inertia and the stiffness of the whole body.
 
     Args:
         moments: volume, centre and second moment of the body at rest.
@@ -105,7 +105,7 @@ def affine_body(
         sag: ratio rho g H / E, as in ``make_body``. A column shortens by half of this fraction.
         poisson_ratio: Poisson's ratio nu.
         density: kg/m^3.
-        damping_ratio: damping ratio of the slowest deformation of the free body.
+        damping_ratio: damping ratio of the slowest deformation mode of the free body.
         device: Warp device of the assembly; default: Warp's current device.
 
     Raises:
@@ -119,7 +119,7 @@ def affine_body(
     root = (axes * np.sqrt(squares)) @ axes.T
     mesh = TetMesh.oriented(moments.centre + _CORNERS @ root, np.array([[0, 1, 2, 3]]))
     node_mass = np.full(4, 0.25 * density * moments.volume)
-    # The element is smaller or larger than the body, and its energy is that of the body's volume.
+    # The volume of the element differs from the volume of the body; the factor corrects the elastic energy for it.
     young = density * GRAVITY * height / sag * moments.volume / float(mesh.volumes()[0])
     undamped = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
     frequency = _slowest_deformation(undamped, node_mass)
@@ -129,7 +129,7 @@ def affine_body(
 
 
 def _slowest_deformation(assembly: ElasticAssembly, node_mass: np.ndarray) -> float:
-    """Return the smallest angular frequency of the free body, rad/s, without its rigid motions."""
+    """Return the smallest angular frequency of the free body's deformation modes, rad/s."""
     upper = assembly.matrix(assembly.hessian_entries(assembly.mesh.nodes)).toarray()
     stiffness = upper + np.triu(upper, 1).T
     squares = linalg.eigh(stiffness, np.diag(np.repeat(node_mass, 3)), eigvals_only=True)

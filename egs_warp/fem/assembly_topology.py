@@ -18,13 +18,13 @@ class Material:
     young_modulus: float
     """Young's modulus E, Pa."""
     poisson_ratio: float
-    """nu, dimensionless."""
+    """Poisson's ratio nu."""
     density: float
     """Mass density at rest, kg/m^3."""
     damping_time: float
     """Coefficient beta of the Rayleigh damping C = beta K at rest, s."""
     relative_stiffness: np.ndarray | None = None
-    """(T,) Young's modulus of each element relative to ``young_modulus``; None is 1 everywhere."""
+    """(T,) Young's modulus of each element relative to ``young_modulus``; None means 1 everywhere."""
 
     def weighted_volumes(self, volumes: np.ndarray) -> np.ndarray:
         """Return ``volumes`` (T,) times the relative stiffness: energy, forces and damping of an element are
@@ -45,7 +45,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Damping:
-    """Reference state of the damping of one step, which resists the change of strain since the step's start.
+    """Reference state of the damping of one step. Damping resists the change of strain since the start of the step.
 
     The strain is invariant under rotations of any size, so the damping does not slow a rigid rotation
     (docs/concepts/body.md).

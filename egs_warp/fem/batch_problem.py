@@ -1,4 +1,4 @@
-"""The implicit Euler steps of many worlds of one body, in one set of tensors, and their tangents (Eq. 4, 6)."""
+"""The implicit Euler steps of one body in many worlds, on tensors with a world axis, and their tangents (Eq. 4, 6)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from egs_warp.muscles.tension import segment_stiffnesses
 from egs_warp.precision import Mat33, Vec3, real
 
 _MIN_LENGTH = 1e-300
-"""Lower bound of segment lengths, m; it gives a segment whose ends coincide the direction 0."""
+"""Lower bound of segment lengths, m. A segment whose ends coincide gets the direction 0."""
 
 
 class BatchBody:
@@ -68,10 +68,10 @@ class BatchBody:
     def add_muscle_stiffness(
         self, matrices: torch.Tensor, positions: torch.Tensor, tensions: torch.Tensor, factor: float
     ) -> None:
-        """Add ``factor`` times the Hessian of the muscle energy to the lower triangles of ``matrices``.
+        """Add ``factor`` times the Hessian of the muscle energy to ``matrices``.
 
-        Stiffnesses of at most ``MIN_RELATIVE_STIFFNESS`` times the largest of the same world are dropped, as in
-        ``TensionHessian.rank_one_terms``.
+        Stiffnesses of at most ``MIN_RELATIVE_STIFFNESS`` times the largest stiffness of the same world are dropped, as
+        in ``TensionHessian.rank_one_terms``.
 
         Args:
             matrices: (c, 3N, 3N) kg, modified in place.
@@ -100,7 +100,7 @@ class BatchBody:
 
 @dataclass(frozen=True, kw_only=True)
 class BatchProblem(ImplicitStep):
-    """The implicit steps of c worlds, in tensors on their device."""
+    """The implicit steps of c worlds, with tensors on the device of the body."""
 
     worlds: BatchBody
     """Data that the worlds share."""
@@ -163,11 +163,11 @@ class BatchProblem(ImplicitStep):
 
     @property
     def gravity(self) -> torch.Tensor:
-        """(3,) m/s^2."""
+        """(3,) m/s^2, gravitational acceleration."""
         return self.worlds.gravity
 
     def is_inversion_free(self, velocities: torch.Tensor) -> torch.Tensor:
-        """Return, for each world, True if no element is inverted at the end positions of ``velocities``: (c,) bool."""
+        """Return (c,) bool, True for worlds in which no element is inverted at the end positions for ``velocities``."""
         _, determinants = self.worlds.elements.enqueue_energies(
             as_warp(self.end_positions(velocities), Vec3), None, 0.0
         )
@@ -180,8 +180,8 @@ class BatchProblem(ImplicitStep):
         return gradient
 
     def enqueue_gradient(self, ends: torch.Tensor, tension: torch.Tensor | None, gradient: torch.Tensor) -> None:
-        """Write minus the internal forces at the end positions ``ends`` (c, N, 3) to ``gradient``, as
-        ``internal_gradient``.
+        """Write minus the internal forces at the end positions ``ends`` (c, N, 3) m to ``gradient`` (c, N, 3) N, with
+        muscle tensions (c, M) N.
         """
         worlds = self.worlds
         segments, loads = (None, None) if tension is None else (worlds.segments, as_warp(tension, real))
@@ -191,7 +191,7 @@ class BatchProblem(ImplicitStep):
     def factor(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
         """Factor the derivative of the residual, or a positive definite approximation of it, into the worlds' slots.
 
-        It tries the same matrices in the same order as ``StepProblem.tangent``.
+        The fallback matrices are the same as in ``StepProblem.tangent``.
 
         Args:
             velocities: (c, N, 3) m/s, linearization point.
@@ -249,9 +249,16 @@ def enqueue_step_start(
     inverse_inertia: torch.Tensor,
     guess: torch.Tensor,
 ) -> None:
-    """Write the values at the start of steps of ``dt`` seconds: lever arms (c, N, 3), rotation modes (c, 3N, 3),
-    inverse inertia (c, 3, 3) and rigid guess (c, N, 3), for the ``mass`` (N,) of the nodes and the ``state``, positions
-    and velocities (c, N, 3).
+    """Compute the values at the start of a step that ``BatchProblem`` holds, asynchronously.
+
+    Args:
+        dt: step size, s.
+        mass: (N,) kg, lumped masses.
+        state: positions (c, N, 3) m and velocities (c, N, 3) m/s.
+        arms: (c, N, 3), output: lever arms.
+        modes: (c, 3N, 3), output: rotation modes.
+        inverse_inertia: (c, 3, 3), output.
+        guess: (c, N, 3), output: rigid guess.
     """
     lanes = kernels.BLOCK if arms.is_cuda else 1
     launch_on(
@@ -270,7 +277,7 @@ def apply_inverse(
     """Return the velocity changes J^-1 ``impulses`` and the momentum projection that was used.
 
     Args:
-        problem: the step, whose slots hold factors.
+        problem: the steps, whose slots hold factors.
         impulses: (c, 3N, m) N s.
         projection: momentum projection of these factors; computed if None.
 

@@ -1,7 +1,7 @@
-"""Arrays of one world or of many: records with a leading world axis, and kernel launches in the memory of NumPy arrays
-or PyTorch tensors.
+"""Arrays of one world or of many: records with a leading world axis, and kernel launches on NumPy arrays or PyTorch
+tensors.
 
-PyTorch is not imported, so that one world on a CPU does not need it.
+PyTorch is not imported here, so that it is not required for one world on a CPU.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class BatchedRecord:
         return replace(self, **{name: _rows(value, worlds) for name, value in self.batched_fields()})
 
     def subset(self, worlds: torch.Tensor) -> Self:
-        """Return ``gather`` of ascending ``worlds``, or this record itself, without a copy, if these are all worlds."""
+        """Return a record of the ascending ``worlds`` (k,); if these are all worlds, this record itself, uncopied."""
         _, first = next(iter(self.batched_fields()))
         return self if len(worlds) == _count(first) else self.gather(worlds)
 
@@ -42,7 +42,7 @@ class BatchedRecord:
                 value[worlds] = rows
 
     def download(self) -> list[Self]:
-        """Return the record of each world on the host, with NumPy arrays and Python's numbers."""
+        """Return the record of each world on the host, with NumPy arrays and Python numbers."""
         columns = {
             name: value.download() if isinstance(value, BatchedRecord) else _rows_on_host(value)
             for name, value in self.batched_fields()
@@ -74,17 +74,17 @@ def nonzero(mask: torch.Tensor) -> torch.Tensor:
 
 
 def array_module(values: Any) -> Any:
-    """Return the module, NumPy or PyTorch, whose functions take ``values``."""
+    """Return the module, NumPy or PyTorch, whose functions accept ``values``."""
     return np if isinstance(values, np.ndarray) else sys.modules["torch"]
 
 
 def empty_like(values: Any, shape: tuple[int, ...]) -> Any:
-    """Return an uninitialized array of ``shape``, otherwise like ``values``, a NumPy array or a tensor."""
+    """Return an uninitialized array of ``shape``, of the kind, type and device of ``values``."""
     return np.empty(shape, values.dtype) if isinstance(values, np.ndarray) else values.new_empty(shape)
 
 
 def padded(values: Any, more: int) -> Any:
-    """Pad ``values`` (c, K, ...), a tensor, with ``more`` zeros along the second axis."""
+    """Pad the tensor ``values`` (c, K, ...) with ``more`` zeros along the second axis."""
     if not more:
         return values
     wide = values.new_zeros((len(values), values.shape[1] + more, *values.shape[2:]))
@@ -108,14 +108,14 @@ def launch_on(
     outputs: list[Any],
     block_dim: int = 256,
 ) -> None:
-    """Launch ``kernel`` where ``target`` is.
+    """Launch ``kernel`` on the device of ``target``.
 
     Args:
-        target: an array, or the device of all tensors.
+        target: a NumPy array, a tensor, or a PyTorch device.
         kernel: the Warp kernel.
         dim: launch dimensions.
-        inputs: arguments; an array or tensor is passed as a pair of itself, contiguous, and the element type.
-        outputs: output arguments, likewise.
+        inputs: arguments; a contiguous array or tensor is given as a pair (array, element type).
+        outputs: output arguments, given in the same form.
         block_dim: threads per block.
     """
     input_arrays, output_arrays = ([_array(value) for value in values] for values in (inputs, outputs))

@@ -61,7 +61,7 @@ class SoftBody:
 
     @property
     def stiffening(self) -> float:
-        """Ratio of E to that of a column of the same height with the default sag."""
+        """Young's modulus, divided by the modulus of a column of the same height and density with the default sag."""
         return self.young_modulus * DEFAULT_SAG / (self.assembly.material.density * GRAVITY * self.height)
 
     @cached_property
@@ -120,7 +120,7 @@ class SoftBody:
 
 @dataclass(frozen=True)
 class BodyState(BatchedRecord):
-    """Positions and velocities of the nodes at one point in time; those of c worlds are tensors (c, N, 3)."""
+    """Positions and velocities of the nodes at one point in time. For c worlds, they are tensors (c, N, 3)."""
 
     __repr__ = short_repr
 
@@ -134,8 +134,9 @@ class BodyState(BatchedRecord):
     def with_velocity_kick(self, kick: np.ndarray | None) -> BodyState:
         """Return the state with ``kick`` (N, 3) m/s added to the nodal velocities, or this state if it is None.
 
-        An implicit step from the new state is exactly the step from this one with additional impulses,
-        M (v - v0) = dt f + M kick. Both momenta include them, and contact forces respond to them in the same step.
+        An implicit step from the new state is exactly the step from this state with the additional impulses M kick:
+        M (v - v0) = dt f + M kick. The impulses change linear and angular momentum, and the contact forces respond to
+        them in the same step.
         """
         return self if kick is None else replace(self, velocities=self.velocities + kick)
 

@@ -17,7 +17,7 @@ import warp as wp
 from egs_warp.launching import warp_stream
 
 _MAX_GRAPHS = 64
-"""Capacity of a ``GraphCache``; steps with other sizes or numbers of contacts need graphs of their own."""
+"""Capacity of a ``GraphCache``. Each step size and each number of contacts needs separate graphs."""
 
 
 class _Entered(threading.local):
@@ -31,7 +31,7 @@ _entered = _Entered()
 
 
 class GraphStream:
-    """Stream shared by PyTorch and Warp: on a GPU Warp's stream, so that no synchronization between them is needed."""
+    """Stream that PyTorch and Warp share. On a GPU it is Warp's stream, so that the two need no synchronization."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -79,7 +79,7 @@ class GraphStream:
         return event
 
     def fork_join(self, works: Sequence[Callable[[], None]]) -> None:
-        """Run PyTorch operations concurrently, each in a stream of its own; work queued later follows all of them.
+        """Run PyTorch operations concurrently, each in a separate stream. Work that is queued later runs after them.
 
         The ``works`` must not access each other's memory.
         """
@@ -118,8 +118,8 @@ class GraphStream:
     def record(self, work: Callable[[], None], *, keep: bool = False) -> torch.cuda.CUDAGraph:
         """Capture the device operations of ``work`` in a graph without executing them.
 
-        All graphs share one memory pool for temporary memory: they run one after the other and leave no results there.
-        The first graph is retained, since the pool is released with its last graph. No other thread may use the device
+        All graphs share one pool of temporary memory, because they run sequentially and leave no results in it. The
+        first graph is retained, since the pool is released with its last graph. No other thread may use the device
         during a capture, as its operations would be captured too. Python's garbage collection is disabled during a
         capture, since freeing device memory would synchronize with the device.
 
@@ -166,14 +166,14 @@ class GraphStream:
     def pinned(self, count: int) -> torch.Tensor:
         """Return page-locked host memory (count,) of float64 zeros that a GPU can access directly.
 
-        Warp allocates it. PyTorch, when it frees page-locked memory, records an event on the stream that used it, which
-        aborts the program at exit if Warp's stream has been destroyed before.
+        Warp allocates it, because PyTorch records an event on the stream when it frees page-locked memory. If Warp's
+        stream has already been destroyed, this aborts the program at exit.
         """
         return wp.to_torch(wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._stream is not None))
 
 
 class PinnedUpload:
-    """Float64 values that are uploaded together: page-locked host buffer ``host`` and device tensor ``device``."""
+    """Page-locked buffer ``host`` and tensor ``device`` (count,) of float64 values that are uploaded together."""
 
     def __init__(self, stream: GraphStream, count: int) -> None:
         self.host, self._stream = stream.pinned(count), stream
@@ -187,7 +187,7 @@ class PinnedUpload:
         self.start_copy()
 
     def write(self, *parts: np.ndarray) -> None:
-        """Write the concatenated ``parts``, padded with zeros, to the host buffer, for a graph that calls ``send``.
+        """Write the concatenated ``parts``, padded with zeros, to the host buffer. A graph then calls ``send``.
 
         The call blocks until the previous copy, marked by ``start_copy``, has finished.
         """
@@ -220,7 +220,7 @@ class GraphCache:
         self._graphs: OrderedDict[Hashable, Callable[[], None]] = OrderedDict()
 
     def run(self, key: Hashable, work: Callable[[], None]) -> None:
-        """Run ``work``, or the graph that was captured under the same ``key``."""
+        """Run ``work``, or the graph that was captured from it under the same ``key``."""
         if key not in self._graphs:
             self._keep(key, self._stream.run_captured(work))
         self._graphs.move_to_end(key)
@@ -244,7 +244,7 @@ class GraphCache:
 
 
 class _Graph:
-    """Operations that run directly at the first call and from a graph afterwards."""
+    """Operations that run directly at the first call and as a graph afterwards."""
 
     def __init__(self, work: Callable[[], None], stream: GraphStream) -> None:
         self._work, self._stream, self._warm = work, stream, False

@@ -10,6 +10,7 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import shortest_path
 
 _MAX_CUTS = 3
+"""Maximum number of cuts, which divide the unknowns into one part more."""
 _MAX_SEQUENTIAL_FRACTION = 0.8
 """Fraction of the unknowns eliminated in sequence above which a dissection saves less time than its launches cost."""
 
@@ -36,8 +37,8 @@ class Dissection:
     def of(cls, upper: sparse.csc_matrix | sparse.csc_array) -> Dissection:
         """Dissect a matrix whose pattern has the upper triangle ``upper``.
 
-        The candidates for cuts are the levels of a breadth-first search from one end of the graph. The choice minimizes
-        the number of unknowns of the largest part plus that of all cuts.
+        The candidates for cuts are the levels of a breadth-first search from one end of the graph. The chosen cuts
+        minimize the number of unknowns in the largest part plus the number of unknowns in all cuts.
         """
         count = len(upper.indptr) - 1
         whole = cls([np.arange(count)], np.zeros(0, int))
@@ -58,9 +59,9 @@ class Dissection:
 
 
 def _levels(graph: sparse.csr_matrix) -> np.ndarray:
-    """Return the distance (n,), in edges, of each vertex from one end of the ``graph``.
+    """Return (n,) int, the distance of each vertex from one end of the ``graph``, in edges.
 
-    Vertices that are not connected to that end form one further level.
+    Vertices that are not connected to this end form one additional level.
     """
     level = np.zeros(len(graph.indptr) - 1)
     for _ in range(2):

@@ -32,7 +32,7 @@ class ElasticAssembly:
         self.diagonal_entries = self.upper_pattern.indptr[1:] - 1
         on_device = SimdElasticity if self.device.is_cpu else WarpElasticity
         elements = on_device(self.maps, material, self.device)
-        # Any, because the arguments of one implementation are results of the same one.
+        # Typed as Any, because each implementation accepts only arrays that it has created itself.
         self.elements: Any = elements
         self._positions, self._gradient, self._energies = map(
             PinnedMirror, (elements.node_vectors(), elements.node_vectors(), elements.determinants_and_energies)
@@ -71,14 +71,14 @@ class ElasticAssembly:
         return Damping(dt, start)
 
     def _upload(self, positions: np.ndarray, damping: Damping | None) -> tuple[wp.array, wp.array | None, float]:
-        """Return the first arguments of the launches of the elements."""
+        """Upload ``positions``; return the first arguments of the methods of ``elements``: positions, start, dt."""
         self._positions.put(positions)
         start, dt = (None, 0.0) if damping is None else (damping.start, damping.dt)
         return self._positions.array, start, dt
 
     def load_segments(self, tension: MuscleEnergy | None) -> Any:
-        """Return the segments of ``tension`` as the elements read them, loaded with its tensions, or None; they are
-        cached for one set of muscles."""
+        """Return the muscle segments in the form that ``elements`` uses, with the tensions of ``tension``; None if it
+        is None. The segments of the last set of muscles are cached."""
         if tension is None:
             return None
         if self._segments is None or self._segments.rows is not tension.rows:

@@ -20,13 +20,13 @@ class FrontLayout:
     """Index maps of the fronts, and the sizes of the arrays in float64 numbers."""
 
     fronts: Any
-    """``kernels.fem.supernodal.Fronts``, the index maps as the kernels read them."""
+    """``kernels.fem.supernodal.Fronts``, the struct with the index maps for the kernels."""
     front: int
-    """Size of the largest front, stored row by row with row lengths padded to multiples of 8."""
+    """Size of the largest front. It is stored row by row, and row lengths are padded to multiples of 8."""
     scratch: int
     """Size of the scratch memory behind the front."""
     stack: int
-    """Size of the stack of update matrices that are not yet added to their parents."""
+    """Maximum size of the stack of update matrices that have not been added to their parents yet."""
     factor: int
     """Size of L, each block stored row by row."""
     inverses: int
@@ -38,7 +38,7 @@ class FrontLayout:
         widths, heights, parents = (part.astype(np.int64) for part in (blocks.widths, blocks.heights, blocks.parents))
         strides, inverses = -(-heights // 8) * 8, -(-widths // BLOCK) * BLOCK**2
         row_in_front = _front_row_lookup(blocks)
-        # An entry belongs to the block of the column that is eliminated first.
+        # Of the two unknowns of an entry, the one that is eliminated first determines its block.
         ends = (
             blocks.permutation[upper.indices],
             blocks.permutation[np.repeat(np.arange(len(upper.indptr) - 1), np.diff(upper.indptr))],

@@ -1,9 +1,9 @@
 """The equation of one implicit Euler step, in one world or in many (Eq. 4, 6).
 
 A step is an equation for the end velocities v: M (v - v0) + dt alpha M v = dt (P^T f(x + dt v) + M g + f_contact), with
-the forces f of elasticity, damping and muscles. ``ImplicitStep`` holds its formulas. ``step_problem.StepProblem`` is
-the step of one world in NumPy arrays (N, 3), ``batch_problem.BatchProblem`` those of c worlds in PyTorch tensors (c, N,
-3). In the shapes below, "..." is the axis of worlds, or nothing.
+the forces f of elasticity, damping and muscles. ``ImplicitStep`` contains the formulas. ``step_problem.StepProblem`` is
+the step of one world, with NumPy arrays (N, 3); ``batch_problem.BatchProblem`` holds the steps of c worlds, with
+PyTorch tensors (c, N, 3). In the shapes below, "..." is the world axis, or nothing for one world.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from egs_warp.fem.momentum_projection import MomentumProjection
 
 UNSOLVABLE = "the tangent is singular or not finite"
 MIN_RELATIVE_STIFFNESS = 1e-3
-"""Fraction of the largest T / L of the muscles below which a stiffness is left out of the tangent."""
+"""Fraction of the largest stiffness of all muscle segments; smaller stiffnesses are left out of the tangent."""
 
 
 class UnsolvableStepError(ArithmeticError):
@@ -25,12 +25,12 @@ class UnsolvableStepError(ArithmeticError):
 
 
 class StepValues(Protocol):
-    """Values that ``ImplicitStep`` takes from its subclasses."""
+    """Values that the subclasses of ``ImplicitStep`` provide."""
 
     node_mass: Any
     """(N,) kg, lumped masses."""
     gravity: Any
-    """(3,) m/s^2."""
+    """(3,) m/s^2, gravitational acceleration."""
     rotation_modes: Any
     """(..., 3N, 3) m, nodal velocities e_k x r of unit rotations about the centre of mass, with lever arms r."""
     inverse_inertia: Any
@@ -45,11 +45,12 @@ class StepValues(Protocol):
 class ImplicitStep(StepValues, BatchedRecord):
     """The equation of one implicit step.
 
-    Implicit Euler alone loses angular momentum: with x+ = x + dt v the momentum changes by dt sum r x f, with the lever
-    arms r at the *start* of the step, about which the internal forces at its end have a torque. P^T removes that torque
-    as the inertial force of a rigid rotation, M (w x r): P v is v minus the rigid rotation with v's angular momentum.
-    So L+ = L + dt sum r x (f_contact - alpha M v) holds up to rounding, contact velocities are those that are solved
-    for, and ``momentum_correction`` is the angular velocity w of the removed rotation.
+    Implicit Euler alone loses angular momentum. With x+ = x + dt v, the momentum changes by dt sum r x f, where r are
+    the lever arms at the *start* of the step. The internal forces f at its end have a torque with these lever arms. The
+    projection P removes from v the rigid rotation with the angular momentum of v, so P^T f is f without its torque: it
+    subtracts the inertial force M (w x r) of a rigid rotation. ``momentum_correction`` is the angular velocity w of
+    that rotation. Then L+ = L + dt sum r x (f_contact - alpha M v) holds up to rounding. The correction acts on the
+    forces only, so the unknowns v of the equation are the actual end velocities, also at the contacts.
     """
 
     body: SoftBody
@@ -103,7 +104,7 @@ class ImplicitStep(StepValues, BatchedRecord):
         return self.dt * (self.inverse_inertia @ torque[..., None])[..., 0]
 
     def residual(self, velocities: Any, tension: Any) -> Any:
-        """Return the left side minus the right side of the equation, without contact forces.
+        """Return the residual, the left side minus the right side of the equation, without contact forces.
 
         Args:
             velocities: (..., N, 3) m/s, at the end of the step.

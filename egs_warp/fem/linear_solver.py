@@ -16,7 +16,8 @@ class FactorStatus(IntEnum):
     """State of the factors of the last matrix."""
 
     NONE = 0
-    """No factors: the matrix is not finite or is singular. A Cholesky solver has none of an indefinite matrix either.
+    """No factors: the matrix is not finite or is singular. Cholesky solvers have no factors of an indefinite matrix
+    either.
     """
     INDEFINITE = 1
     """Factors of an indefinite matrix."""
@@ -36,7 +37,7 @@ class LinearSolver(Protocol):
         ...
 
     def entries_from(self, entries: wp.array) -> Any:
-        """Return a copy of ``entries`` (nnz,) or (1, nnz) where this solver reads them: in a NumPy array, or in a
+        """Return a copy of ``entries`` (nnz,) or (1, nnz) in the form that this solver reads: a NumPy array, or a
         PyTorch tensor on its device."""
         ...
 
@@ -51,7 +52,7 @@ class LinearSolver(Protocol):
 
     @property
     def status(self) -> FactorStatus:
-        """Status of the factors; blocks until queued ones are computed."""
+        """Status of the factors; blocks until queued factors are computed."""
         ...
 
     def add_low_rank(self, across: np.ndarray, rates: np.ndarray) -> bool:

@@ -1,4 +1,4 @@
-"""Rank-3 correction with which the solutions of a step's matrix conserve angular momentum (Eq. 4)."""
+"""Rank-3 correction that makes solutions with a step's matrix conserve angular momentum (Eq. 4)."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class MomentumProjection(BatchedRecord):
         inertia_ratio: float,
         rotation_response: Any,
     ) -> Self:
-        """Build the projection. Of worlds, a singular matrix has an inverse that is not finite; an exception would stop
-        all worlds.
+        """Build the projection; arguments as the fields. With PyTorch tensors, the inverse of a singular matrix is not
+        finite, because an exception would stop all worlds.
         """
         matrix = inertia_ratio * mode_momenta.swapaxes(-1, -2) @ rotation_response
         linalg = array_module(matrix).linalg

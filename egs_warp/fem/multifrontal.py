@@ -24,7 +24,7 @@ from egs_warp.launching import launch_cached, run_concurrently, zeros
 from egs_warp.precision import real
 
 _MIN_RELATIVE_PIVOT = 1e-14
-"""Fraction of the largest diagonal entry at or below which a pivot counts as zero and the matrix as singular."""
+"""Pivot threshold, as a fraction of the largest diagonal entry. A matrix with a pivot at or below it is singular."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,8 @@ class SymbolicFactorization:
     """Symbolic factorization of a sparsity pattern, shared by all matrices with that pattern."""
 
     full_from_upper: np.ndarray
-    """Index into the upper entries of each entry of the full symmetric matrix, in column order."""
+    """(nnz of the full matrix,) index of the upper entry that equals each entry of the full symmetric matrix, in column
+    order."""
     offsets: wp.array
     """(n + 1,) column offsets of the full matrix."""
     indices: wp.array
@@ -68,8 +69,8 @@ class MultifrontalLdl:
 
     The symbolic analysis is done once. Results are bitwise equal on any number of cores.
 
-    There is no pivoting: positive definite matrices need none; of an indefinite matrix only the inertia and a sum with
-    the muscles' stiffness are used; a nearly singular matrix is reported as having no factors.
+    There is no pivoting, because positive definite matrices need none. The factors of an indefinite matrix serve only
+    to compute its inertia and to add the muscles' stiffness. A nearly singular matrix is reported as having no factors.
     """
 
     is_asynchronous = False
@@ -124,7 +125,7 @@ class MultifrontalLdl:
         return entries.numpy().flatten()
 
     def factor(self, entries: np.ndarray, diagonal: np.ndarray | None = None) -> None:
-        """Factor S; see ``LinearSolver.factor``. The factors of an indefinite matrix can be used for solves, too."""
+        """Factor S; see ``LinearSolver.factor``. The factors of an indefinite matrix can be used for solves too."""
         self.negative_pivots, self._added = -1, None
         if not np.isfinite(entries).all():
             return
@@ -166,8 +167,8 @@ class MultifrontalLdl:
         through = self.solve(across)
         small = across.T @ through
         small[np.diag_indices_from(small)] += 1.0 / rates
-        # Haynsworth's inertia additivity: the number of negative eigenvalues of the sum is that of S, plus that of
-        # positive ones of the small matrix, minus that of positive rates.
+        # Haynsworth's inertia additivity: negative eigenvalues of the sum = negative eigenvalues of S + positive
+        # eigenvalues of the small matrix - positive rates.
         positive, inverse = inverse_and_positives(small)
         if self.negative_pivots + positive != int((rates > 0.0).sum()):
             return False
@@ -239,7 +240,7 @@ class MultifrontalLdl:
         return solution
 
     def _launch_two_threads(self, kernel: Any, panels: int, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch ``kernel``, on two threads that share the work if there are several ``panels``."""
+        """Launch ``kernel``; if there are several ``panels``, on two threads that share the work."""
         self._counters[:] = 0
 
         def launch() -> None:
@@ -251,7 +252,7 @@ class MultifrontalLdl:
             launch()
 
     def solving_one(self, projection: MomentumProjection) -> tuple[list[Any], list[int], wp.array]:
-        """Return kernel arguments for ``kernels.fem.supernodal.solve_vector_native``.
+        """Return the kernel arguments of a solve for one right-hand side (``supernodal.solve_vector_native``).
 
         Args:
             projection: momentum projection of the solutions.
@@ -274,7 +275,7 @@ class MultifrontalLdl:
 
     @staticmethod
     def _address_of(right: np.ndarray) -> list[int]:
-        """Return the address, the row and column strides in numbers, and the number of columns."""
+        """Return the address of ``right``, its row and column strides in float64 values, and its number of columns."""
         strides = [stride // 8 for stride in right.strides]
         return [right.ctypes.data, *(strides if right.ndim > 1 else [*strides, 0]), right[0].size]
 
@@ -286,7 +287,7 @@ class MultifrontalLdl:
 
 
 class _ProjectionArrays:
-    """Arrays of a momentum projection as the kernels read them."""
+    """Arrays of a momentum projection and the struct through which the kernels access them."""
 
     def __init__(self, unknowns: int) -> None:
         self.struct = kernels.MomentumProjection()

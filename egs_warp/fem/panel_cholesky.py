@@ -18,8 +18,8 @@ CHUNK_BYTES = 2**31
 
 
 class PanelCholesky:
-    """Dense Cholesky solver for the matrices of several worlds, which have one pattern; ``LinearSolver`` with a world
-    axis.
+    """Dense Cholesky solver for the matrices of several worlds, which all have the same pattern. Its methods resemble
+    ``LinearSolver``, with a world axis.
 
     The factorization is left-looking and proceeds by panels: each panel is updated with all columns before it, its
     diagonal block is factored, and the rows below are multiplied by the inverse of that factor. The inverses are
@@ -36,7 +36,7 @@ class PanelCholesky:
         panel: int = PANEL,
         chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
-        """Allocate factors, 8 worlds n^2 bytes.
+        """Allocate the factors, which take 8 n^2 bytes per world.
 
         Args:
             upper_pattern: (n, n) upper triangle with the diagonal.
@@ -101,7 +101,9 @@ class PanelCholesky:
     def solve(
         self, right: torch.Tensor, select: torch.Tensor, projection: MomentumProjection | None = None
     ) -> torch.Tensor:
-        """Return S^-1 ``right`` (k, n, m) of the worlds ``select`` (k,); apply ``projection`` if given."""
+        """Return S^-1 ``right`` for right-hand sides (k, n, m) of the worlds ``select`` (k,); apply ``projection`` if
+        given.
+        """
         is_complete = len(select) == len(self._factors)
         # A slice of all worlds avoids a copy of the factors.
         parts = [
@@ -111,7 +113,7 @@ class PanelCholesky:
         return plain if projection is None else projection.corrected(right, plain)
 
     def chunks(self, count: int) -> Iterator[slice]:
-        """Return slices of ``count`` worlds to be processed at once; a single empty slice if there are none."""
+        """Return slices of the ``count`` worlds that are processed at once; a single empty slice if there are none."""
         return (slice(start, min(start + self.chunk, count)) for start in range(0, max(count, 1), self.chunk))
 
     def _solve_chunk(self, select: torch.Tensor | slice, right: torch.Tensor) -> torch.Tensor:

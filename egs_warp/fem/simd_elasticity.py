@@ -17,12 +17,12 @@ from egs_warp.precision import real
 
 
 class SimdSegments:
-    """Segments of one set of muscles as the kernels read them."""
+    """Segments of one set of muscles in the layout of the kernels."""
 
     def __init__(self, rows: sparse.csr_matrix, rest_lengths: np.ndarray, device: wp.Device) -> None:
         self.rows = rows
         self.tensions = PinnedMirror(zeros(len(rest_lengths), real, device))
-        """(M,) N, set by the host."""
+        """(M,) N, tensions, which the host sets."""
         self.struct = kernels.MuscleSegments()
         self.struct.offsets, self.struct.nodes = (
             wp.array(part.astype(np.int32), dtype=int, device=device) for part in (rows.indptr, rows.indices)
@@ -53,7 +53,7 @@ class SimdElasticity:
         elements.entries = wp.array(_entries_of_pairs(maps)[padded].ravel(), dtype=int, device=device)
         elements.mu, elements.lam, elements.damping_time = material.mu, material.lam, material.damping_time
         self.elements = elements
-        """The mesh as the kernels read it."""
+        """Elements of the mesh in the layout of the kernels."""
         self._no_segments = self.segments(sparse.csr_matrix((0, self._node_count)), np.zeros(0)).struct
         self._no_start = empty(0, real, device)
         self.energy_offset = len(padded)
@@ -75,7 +75,7 @@ class SimdElasticity:
         return SimdSegments(rows, rest_lengths, self._device)
 
     def struct_of(self, segments: SimdSegments | None) -> Any:
-        """Return the kernels' struct of ``segments``, with no segments if it is None."""
+        """Return the kernels' struct of ``segments``; for None, a struct without segments."""
         return self._no_segments if segments is None else segments.struct
 
     def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
@@ -117,7 +117,7 @@ def _entries_of_pairs(maps: AssemblyTopology) -> np.ndarray:
     for a, b in kernels.PAIRS:
         one, other = tets[:, a], tets[:, b]
         block = np.searchsorted(maps.block_keys, np.minimum(one, other) * count + np.maximum(one, other))
-        # A block below the diagonal is the transpose of the one above.
+        # A block below the diagonal is the transpose of its counterpart above.
         order = np.where((one <= other)[:, None], 3 * i + k, 3 * k + i)
         entries = np.take_along_axis(maps.entry_from_block[block], order, axis=1)
         parts.append(entries[:, i <= k] if a == b else entries)

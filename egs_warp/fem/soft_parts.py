@@ -11,24 +11,29 @@ from egs_warp.fem.body import SoftBody, first_frequency
 from egs_warp.fem.elasticity import ElasticAssembly
 
 MIN_RELATIVE_STIFFNESS = 0.02
-"""Smallest Young's modulus of a part, relative to that of the body."""
+"""Minimum Young's modulus of a part, relative to Young's modulus of the body."""
 _CANTILEVER = 12.362 / 8.0
 """w^2 d / g of a uniform cantilever with first frequency w whose tip sags by d under its weight: 1.875^4 / 8."""
 
 
 def bending_frequency(sag: float, length: float, gravity: float) -> float:
-    """Return the first angular frequency (rad/s) of a uniform cantilever of ``length`` (m) whose tip sags by the
-    fraction ``sag`` of its length under its own weight; ``gravity`` is in m/s^2."""
+    """Return the first angular frequency, rad/s, of a uniform cantilever.
+
+    Args:
+        sag: deflection of its tip under its own weight, as a fraction of its length.
+        length: m.
+        gravity: m/s^2.
+    """
     return float(np.sqrt(_CANTILEVER * gravity / (sag * length)))
 
 
 def with_soft_parts(body: SoftBody, parts: Sequence[np.ndarray], frequencies: Sequence[float]) -> SoftBody:
     """Return ``body`` with softer parts.
 
-    The elements that touch a part get a smaller Young's modulus, so that the first frequency of the part with all
-    other nodes clamped is the requested one; a part whose frequency is lower already stays as it is. Damping is
-    proportional to stiffness, so the damping ratio of a part is that of ``make_body`` times its frequency, divided by
-    the first frequency of the body.
+    The elements that touch a part get a smaller Young's modulus, so that the part has the requested first frequency if
+    all other nodes are clamped. A part whose frequency is already lower is not changed. Damping is proportional to
+    stiffness, so the damping ratio of a part equals ``damping_ratio`` of ``make_body``, times the frequency of the part
+    divided by the first frequency of the body.
 
     Args:
         body: the body.

@@ -19,7 +19,7 @@ from egs_warp.muscles.tension import MuscleEnergy
 
 @dataclass(frozen=True)
 class StepProblem(ImplicitStep):
-    """The implicit step of one world, in NumPy arrays."""
+    """The implicit step of one world, with NumPy arrays."""
 
     def starts_from(self, state: BodyState, dt: float) -> bool:
         """Return True if this is the step of ``dt`` seconds from the same ``state`` object."""
@@ -37,7 +37,7 @@ class StepProblem(ImplicitStep):
 
     @property
     def gravity(self) -> np.ndarray:
-        """(3,) m/s^2."""
+        """(3,) m/s^2, gravitational acceleration."""
         return self.body.gravity
 
     @cached_property
@@ -66,7 +66,7 @@ class StepProblem(ImplicitStep):
         return self.body.angular_momentum(self.state.positions, self.state.velocities)
 
     def is_inversion_free(self, velocities: np.ndarray) -> bool:
-        """Return True if no element is inverted at the end positions of ``velocities`` (N, 3)."""
+        """Return True if no element is inverted at the end positions for ``velocities`` (N, 3) m/s."""
         return bool(self.body.assembly.determinants(self.end_positions(velocities)).min() > 0.0)
 
     @cached_property
@@ -96,10 +96,11 @@ class StepProblem(ImplicitStep):
             tension: muscle energy, or None.
 
         Returns:
-            The tangent. On a GPU without muscles its factors are only queued; ``Tangent.wait`` completes them.
+            The tangent. On a GPU, if ``tension`` is None, its factors are only queued; ``Tangent.wait`` blocks for
+            them.
 
         Raises:
-            UnsolvableStepError: there are no factors.
+            UnsolvableStepError: the approximation cannot be factored either.
         """
         self._factor(factors, velocities, projected=False)
         if tension is None and factors.is_asynchronous:
@@ -115,17 +116,17 @@ class StepProblem(ImplicitStep):
         return Tangent(self, factors)
 
     def factor_near(self, factors: LinearSolver, velocities: np.ndarray) -> None:
-        """Factor a positive definite approximation of S.
+        """Factor a positive definite approximation of S, with projected element Hessians.
 
         Raises:
-            UnsolvableStepError: there are no factors.
+            UnsolvableStepError: the approximation cannot be factored.
         """
         self._factor(factors, velocities, projected=True)
         if factors.status is FactorStatus.NONE:
             raise UnsolvableStepError(UNSOLVABLE)
 
     def _factor(self, factors: LinearSolver, velocities: np.ndarray, *, projected: bool) -> None:
-        """Factor S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``."""
+        """Factor S = (1 + dt alpha) M + dt C + dt^2 K at the end positions for ``velocities`` (N, 3) m/s."""
         end = self.end_positions(velocities)
         entries = self.body.assembly.enqueue_hessian(end, self.damping, factor=self.dt**2, projected=projected)
         factors.factor(factors.entries_from(entries), self.inertia_ratio * self.coordinate_mass)
@@ -136,8 +137,8 @@ class Tangent:
     """Inverse J^-1 of the derivative of a step's residual.
 
     J = S + dt^2 (K_a - M T I^-1 T^T (K + K_a)) with the elements' matrix S, the muscles' stiffness K_a and the rotation
-    modes T. Its inverse is that of S + dt^2 K_a plus rigid rotations that give each column of the result the angular
-    momentum of its impulse.
+    modes T. J^-1 is the inverse of S + dt^2 K_a, followed by rigid rotations that give each column of the result the
+    angular momentum of its impulse.
     """
 
     problem: StepProblem
@@ -145,16 +146,16 @@ class Tangent:
     factors: LinearSolver
     """Factors of S + dt^2 K_a."""
     pending_velocities: np.ndarray | None = None
-    """(N, 3) m/s, linearization point of factors that are only queued; None if they exist."""
+    """(N, 3) m/s, linearization point of factors that are only queued; None if the factors are computed."""
 
     def wait(self) -> bool:
-        """Wait for queued factors. If there are none, factor a positive definite approximation instead.
+        """Block until queued factors are computed. If S is not positive definite, factor an approximation instead.
 
         Returns:
             False if the approximation was needed.
 
         Raises:
-            UnsolvableStepError: the approximation has no factors.
+            UnsolvableStepError: the approximation cannot be factored.
         """
         if self.pending_velocities is None or self.factors.status is FactorStatus.DEFINITE:
             return True

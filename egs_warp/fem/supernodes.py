@@ -14,31 +14,31 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
 _MAX_MERGED_WIDTH, _MAX_CHILD_WIDTH = 16, 6
-"""Maximum number of columns of two blocks together, or of the child alone, for the larger fill tolerance."""
+"""Maximum widths, in columns, up to which a merged block is narrow: of the merged block, or of the child alone."""
 _FILL_FRACTION = 0.3
-"""Maximum fraction of zeros in a merged block of these widths; for others a third of it."""
+"""Maximum fraction of zeros in a narrow merged block. For other merged blocks it is a third of this."""
 
 
 @dataclass(frozen=True)
 class Supernodes:
-    """Blocks of L, P A P^T = L D L^T, in the order of elimination; children come before their parent.
+    """Blocks of the factor L in P A P^T = L D L^T, in the order of elimination; children come before their parent.
 
-    Block s has ``widths[s]`` columns from ``first[s]`` on. The rows of its front are these columns, followed by
-    ``rows[row_offsets[s] + widths[s] : row_offsets[s + 1]]`` below them, all permuted.
+    Block s has ``widths[s]`` columns from ``first[s]`` on. Its front has the rows with the numbers of these columns,
+    and below them the rows ``rows[row_offsets[s] + widths[s] : row_offsets[s + 1]]``; all numbers are permuted.
     """
 
     permutation: np.ndarray
     """(n,) position of each row of A in the order of elimination."""
     first: np.ndarray
-    """(S,) first column."""
+    """(S,) first column of each block."""
     widths: np.ndarray
-    """(S,) number of columns."""
+    """(S,) number of columns of each block."""
     row_offsets: np.ndarray
     """(S + 1,) offset of each front in ``rows``."""
     rows: np.ndarray
-    """Rows of all fronts, ascending in each."""
+    """Rows of all fronts, ascending in each front."""
     parents: np.ndarray
-    """(S,) parent block, -1 for roots."""
+    """(S,) parent of each block in the elimination tree, -1 for roots."""
 
     @property
     def count(self) -> int:
@@ -88,7 +88,7 @@ class Supernodes:
 
 
 def first_of_equal_rows(full: sparse.csc_matrix) -> np.ndarray:
-    """Return (n,) bool: False for each row whose pattern equals that of the row before, like the rows of one node.
+    """Return (n,) bool, False for each row with the same pattern as the previous row, like the rows of one node.
 
     ``full`` is a symmetric matrix with both triangles and sorted indices.
     """
@@ -119,7 +119,7 @@ def _ordered(thin: sparse.csc_matrix) -> np.ndarray:
 def _structures(thin: sparse.csc_matrix, order: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
     """Return the structure of the factor of ``thin`` in ``order``: rows below the diagonal of each column, and parents.
 
-    Rows are ascending. Parents are those of the elimination tree, -1 for roots.
+    Rows are ascending. Parents are columns in the elimination tree, -1 for roots.
     """
     count = len(order)
     position = np.empty(count, dtype=np.int64)
@@ -138,7 +138,7 @@ def _structures(thin: sparse.csc_matrix, order: np.ndarray) -> tuple[list[np.nda
 
 
 def _postorder(parents: np.ndarray) -> np.ndarray:
-    """Return the nodes (n,) of a forest in an order in which each follows all of its descendants."""
+    """Return the nodes (n,) of a forest in an order in which each node follows all of its descendants."""
     children: list[list[int]] = [[] for _ in parents]
     for node, parent in enumerate(parents):
         if parent >= 0:
@@ -174,7 +174,7 @@ def _merged(runs: list[tuple[int, int]], below: list[np.ndarray], sizes: np.ndar
     """First, last + 1, rows below, and the number of entries that are not padding."""
     for (first, last), rows in zip(runs, below, strict=True):
         own = area(first, last, rows)
-        # Preceding blocks that are its children, the last first.
+        # Children of the run among the preceding blocks, in reverse order.
         while blocks and len(blocks[-1][2]) > 0 and blocks[-1][2][0] < last and blocks[-1][2][0] >= first:
             before, _, _, needed = blocks[-1]
             merged = area(before, last, rows)

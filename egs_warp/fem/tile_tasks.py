@@ -1,4 +1,4 @@
-"""Task list of the tiled inverse Cholesky factor: one task per tile, ordered so that none depends on a later one."""
+"""Task list of the tiled inverse Cholesky factor: one task per tile, ordered so that no task depends on a later one."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _MIN_PRODUCTS = 8
 class TileTaskGraph:
     """Tasks of ``tiled_inverse_kernel`` for a matrix in the order of its dissection.
 
-    With L the factor of S, the columns of tiles of L and, below them, of L^-T are computed one after the other. A tile
-    is the tile of S or of the identity, minus the products of the tiles to its left in its own row and in the row of
-    its column's diagonal tile, times the inverse of the diagonal factor. Parts share no rows, so all parts proceed in
-    parallel. Meanwhile, separate tasks sum their contributions to the separator.
+    With L the factor of S, the columns of tiles of L and, below them, of L^-T are computed one after the other. The
+    tile of L in row i and column j is (S_ij - sum_k L_ik L_jk^T) L_jj^-T, with the sum over the columns k to its left.
+    In the rows of L^-T, the identity takes the place of S. Parts share no rows, so all parts proceed in parallel.
+    Meanwhile, separate tasks sum their contributions to the separator.
     """
 
     tasks: np.ndarray
@@ -106,7 +106,9 @@ class TileTaskGraph:
                 self._add(Kind.ZEROS, start, count, first, start + count)
 
     def _diagonal(self, group: range, depth: int) -> None:
-        """Add a task for the inverse of a diagonal factor and, unless it is the group's first, the tile to its left."""
+        """Add a task for the inverse of a diagonal factor. Except in the first column of a group, the task also
+        computes the tile to its left.
+        """
         column = group[depth]
         slots = {"diagonal": column, "transposed": self._slot(self.columns + column, column)}
         if depth == 0:

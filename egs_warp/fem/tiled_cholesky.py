@@ -24,14 +24,14 @@ from egs_warp.kernels.fem.tiled_inverse import BLOCK, TILE_SIDE, tiled_inverse_k
 from egs_warp.precision import Mat33, real
 
 _PROCESSOR_FRACTION = 10 / 11
-"""Fraction of a GPU's multiprocessors that the kernel occupies; the others are free for concurrent work."""
+"""Fraction of a GPU's multiprocessors that the kernel occupies; the rest stays available for concurrent work."""
 
 
 class TiledCholesky:
     """Dense Cholesky solver for symmetric matrices of one pattern; implements ``LinearSolver``.
 
-    The inverse factor L^-1 is computed once per matrix. A triangular solve takes the same time for one right-hand side
-    as for a thousand, and a product with L^-1 takes a fiftieth of that time.
+    The inverse factor L^-1 is computed once per matrix, because a product with L^-1 takes a fiftieth of the time of a
+    triangular solve. The latter takes as long for one right-hand side as for a thousand.
     """
 
     is_asynchronous = True
@@ -57,14 +57,14 @@ class TiledCholesky:
         self._entries, self._diagonal = self._energy_hessian.new_zeros(len(rows)), self._energy_hessian.new_zeros(count)
         self._uploaded_diagonal = np.zeros(count)
         self._verdict_readback, self.verdict = self.stream.pinned(2), self._energy_hessian.new_zeros(2)
-        """(2,) on the host and on the device: nonzero if the entries are finite, and if the matrix is positive
-        definite."""
+        """(2,) flags on the host and on the device: nonzero if the entries are finite, and nonzero if the matrix is
+        positive definite."""
         self._factored = self.stream.run_captured(self._factor)
         self.rotation_response, self.rotation_operator = (
             self._energy_hessian.new_zeros(shape) for shape in ((count, 3), (3, count))
         )
-        """(n, 3) and (3, n) of the momentum projection: their product times a right-hand side is added to its
-        solution."""
+        """(n, 3) and (3, n), factors of the momentum projection: the solution for a right-hand side b is corrected by
+        adding ``rotation_response`` ``rotation_operator`` b."""
         self._momentum_matrices = self._energy_hessian.new_zeros(2, 3, 3)
         self._half_solved, self._solved = self._energy_hessian.new_zeros(2, count)
         self._rotation = self._energy_hessian.new_zeros(3)
@@ -91,9 +91,9 @@ class TiledCholesky:
             self._diagonal.copy_(self._to_device(diagonal))
 
     def enqueue_factor(self, entries: torch.Tensor) -> None:
-        """Queue ``factor`` with the uploaded diagonal, as part of a graph.
+        """Queue the factorization with the uploaded diagonal, as part of a graph.
 
-        The caller of the graph reports its launch with ``mark_started``.
+        After launching the graph, the caller must call ``mark_started``.
         """
         self._entries.copy_(entries)
         self._factor()
@@ -111,11 +111,11 @@ class TiledCholesky:
         self._verdict_readback.copy_(self.verdict, non_blocking=True)
 
     def mark_started(self) -> None:
-        """Report that factors are queued; ``status`` then waits for them."""
+        """Record that factors are queued; ``status`` then blocks until they are computed."""
         self._pending = True
 
     def _factor(self) -> None:
-        """Queue the factorization of the current entries and diagonal, and of its verdict."""
+        """Queue the factorization with the current entries and diagonal, and the download of its ``verdict``."""
         self._root.matrix.view(-1)[self.places] = self._entries
         self._root.matrix.diagonal().add_(self._diagonal[self._root.order])
         definite = self._root.factor()
@@ -136,12 +136,12 @@ class TiledCholesky:
 
     @property
     def status(self) -> FactorStatus:
-        """Status of the factors; blocks until queued ones are computed."""
+        """Status of the factors; blocks until queued factors are computed."""
         self._finish()
         return self._status
 
     def _finish(self) -> None:
-        """Wait for queued factors and read their verdict."""
+        """Block until queued factors are computed, and read their verdict."""
         if self._pending:
             self.stream.wait()
             self._pending = False
@@ -158,11 +158,11 @@ class TiledCholesky:
 
     @property
     def inverse(self) -> torch.Tensor:
-        """(n, n) R with S^-1 = R^T R on the device: L^-1 with permuted unknowns. Its address never changes."""
+        """(n, n) matrix R on the device with S^-1 = R^T R: L^-1 with permuted unknowns. Its address never changes."""
         return self._root.inverse
 
     def enqueue_solve(self, right: torch.Tensor) -> torch.Tensor:
-        """Queue S^-1 ``right``."""
+        """Queue S^-1 ``right`` (n, m) and return the result."""
         return self.inverse.T @ (self.inverse @ right)
 
     def enqueue_momentum_projection(
@@ -189,7 +189,7 @@ class TiledCholesky:
         )
 
     def enqueue_projected_solve(self, right: torch.Tensor) -> torch.Tensor:
-        """Queue S^-1 ``right`` (n, m) with the momentum projection that was queued last."""
+        """Queue S^-1 ``right`` (n, m) with the last queued momentum projection, and return the result."""
         return self.enqueue_solve(right).addmm_(self.rotation_response, self.rotation_operator @ right)
 
     def enqueue_vector_solve(self, right: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -199,8 +199,8 @@ class TiledCholesky:
             right: (n,).
 
         Returns:
-            S^-1 ``right`` (n,) and (3,), whose product with ``rotation_response`` must be added to it. The next call
-            overwrites both.
+            S^-1 ``right`` (n,), and (3,) coefficients r. For the projected solution, ``rotation_response`` r must be
+            added. The next call overwrites both.
         """
         torch.mv(self.inverse, right, out=self._half_solved)
         torch.mv(self.inverse.T, self._half_solved, out=self._solved)
@@ -256,10 +256,10 @@ class TiledCholesky:
 
 
 class _InverseFactor:
-    """R with S^-1 = R^T R for symmetric matrices S (n, n) of one pattern.
+    """Inverse factor R with S^-1 = R^T R for symmetric matrices S (n, n) of one pattern.
 
-    R is L^-1 of S permuted to the order of the dissection, with columns in the order of S. On a GPU the slabs are
-    eliminated in parallel, tile by tile; on a CPU PyTorch factors the whole matrix.
+    R is L^-1 for S permuted to the order of the dissection; the columns of R are in the original order of S. On a GPU
+    the slabs are eliminated in parallel, tile by tile; on a CPU PyTorch factors the whole matrix.
     """
 
     def __init__(self, dissection: Dissection, stream: GraphStream) -> None:
@@ -272,9 +272,9 @@ class _InverseFactor:
             torch.from_numpy(each).to(device) for each in (permutation, order.astype(np.int64))
         )
         self.matrix, self.inverse = torch.zeros((2, count, count), dtype=torch.float64, device=device)
-        """(n, n) each: the matrix S, of which the lower triangle is read, and R, both in the order of the dissection.
+        """(n, n) each: the matrix S in the order of the dissection, of which only the lower triangle is read, and R.
         """
-        # Keys are the numbers of directions that are added at once.
+        # The keys are numbers of directions k.
         self._small: dict[int, tuple[_TriangularInverse, _TriangularInverse]] = {}
         self._tiled = (
             TiledInverseFactor(dissection, self.matrix, self.inverse, stream) if device.type == "cuda" else None
@@ -285,7 +285,7 @@ class _InverseFactor:
         return _TriangularInverse(len(self.order), self._stream)
 
     def entry_slots(self, rows: np.ndarray, columns: np.ndarray) -> torch.Tensor:
-        """Return the positions of the entries at ``rows`` and ``columns`` of one triangle in the flat ``matrix``."""
+        """Return the positions in the flat ``matrix`` of the entries of one triangle at ``rows`` and ``columns``."""
         one, other = self._host_permutation[rows], self._host_permutation[columns]
         slots = np.maximum(one, other) * len(self.order) + np.minimum(one, other)
         return torch.from_numpy(slots).to(self._stream.device)
@@ -299,7 +299,7 @@ class _InverseFactor:
         return definite
 
     def add_low_rank(self, directions: torch.Tensor, sign: float) -> torch.Tensor:
-        """Update R from S to S + ``sign`` U^T U, ``directions`` U (k, n).
+        """Update R from S to S + ``sign`` U^T U, with ``directions`` U (k, n).
 
         With W = R U^T and K K^T = 1 + sign W^T W, the new factor is (1 - sign W K^-T (K + 1)^-1 W^T)^T R (Andrews, AIAA
         Journal 6(6), 1968). Only k x k matrices are factored.
@@ -321,7 +321,7 @@ class _InverseFactor:
         return info == 0
 
     def factor_with(self, across: torch.Tensor, rates: torch.Tensor) -> bool:
-        """Compute R of ``matrix`` + U diag(r) U^T, ``across`` U (n, m), ``rates`` r (m,).
+        """Compute R of ``matrix`` + U diag(r) U^T, with ``across`` U (n, m) and ``rates`` r (m,).
 
         Returns:
             True if the sum is positive definite; otherwise R is unchanged.
@@ -337,9 +337,9 @@ class _InverseFactor:
 
 
 class TiledInverseFactor:
-    """R with S^-1 = R^T R for symmetric matrices S (n, n), computed by one kernel.
+    """Inverse factor R with S^-1 = R^T R for symmetric matrices S (n, n), computed by one kernel.
 
-    R is L^-1 of S permuted to the order of the dissection, with columns in the order of S.
+    R is L^-1 for S permuted to the order of the dissection; the columns of R are in the original order of S.
     """
 
     def __init__(
@@ -405,14 +405,14 @@ class _TriangularInverse:
         self.inverse = self._out[:count, :count]
 
     def factor(self, matrix: torch.Tensor) -> torch.Tensor:
-        """Set ``inverse`` to that of the Cholesky factor of ``matrix`` (n, n); return () bool, True if that is positive
-        definite."""
+        """Set ``inverse`` to the inverse of the Cholesky factor of ``matrix`` (n, n); return a () bool tensor, True if
+        the matrix is positive definite."""
         factor, info = torch.linalg.cholesky_ex(matrix)
         self.invert(factor)
         return info == 0
 
     def invert(self, lower: torch.Tensor) -> None:
-        """Set ``inverse`` to that of a ``lower`` triangular matrix (n, n)."""
+        """Set ``inverse`` to the inverse of the ``lower`` triangular matrix (n, n)."""
         self._lower[: self._count, : self._count] = lower
         side = self._side
         # PyTorch would invert the blocks one after the other.

@@ -41,7 +41,7 @@ class MuscleSegmentMaps:
             LENGTH_FULL_FORCE,
         ]
         self.tensions = PinnedMirror(zeros((1, len(rest_lengths)), real, device))
-        """(1, M) N, tensions of one world that the host sets."""
+        """(1, M) N, tensions of one world, which the host sets."""
         self._forces = zeros((worlds, len(rest_lengths)), Vec3, device)
 
     def _index(self, rows: sparse.csr_matrix) -> list[wp.array]:
@@ -68,8 +68,8 @@ class MuscleSegmentMaps:
 class WarpElasticity:
     """Elasticity of one mesh in one or many worlds: arrays and scratch memory on a device.
 
-    Arrays of B worlds have a leading world axis, B at most ``worlds``; it may be missing for one world. A method
-    returns an array that the next call overwrites, of which the first B rows are the result.
+    Arrays of B worlds, at most ``worlds``, have a leading world axis; it may be missing for one world. The first B rows
+    of a returned array are the result; the next call overwrites the array.
     """
 
     def __init__(
@@ -129,8 +129,8 @@ class WarpElasticity:
         return [self._no_gradients if start is None else _by_world(start), positions, dt]
 
     def enqueue_start(self, positions: wp.array, gradients: wp.array) -> None:
-        """Queue the deformation ``gradients`` (B, T) at ``positions`` (B, N), the reference of the damping of a
-        step."""
+        """Compute the deformation ``gradients`` (B, T) at ``positions`` (B, N) m, which are the reference state of the
+        damping of a step, asynchronously."""
         positions = _by_world(positions)
         launch_cached(
             kernels.deformation_gradients_kernel,
@@ -169,7 +169,7 @@ class WarpElasticity:
             dt: step size, s, or 0 for no damping.
             segments: muscle segments, or None.
             gradient: (B, N) Vec3, N, output.
-            tensions: (B, M) N; None for those that the host has set.
+            tensions: (B, M) N, tensions; None uses the tensions that the host has set in ``segments``.
         """
         positions, ends, forces = _by_world(positions), self._no_ends, self._no_forces
         if segments is not None:

@@ -1,7 +1,7 @@
-"""Optimum of a strictly convex QP to rounding, from a guess of its active constraints.
+"""Solution of strictly convex QPs up to rounding, from a guess of the active constraints.
 
-The dual active-set method of Goldfarb and Idnani (1983), started at the guess. Its kernels are in
-``egs_warp.kernels.locomotion.quadratic_program`` and ``active_set``, which the mode search on a GPU uses, too.
+The method is the dual active-set method of Goldfarb and Idnani (1983), started at the guess. Its kernels are in
+``egs_warp.kernels.locomotion.quadratic_program`` and ``active_set``; the mode search on a GPU uses ``active_set`` too.
 """
 
 from __future__ import annotations
@@ -25,18 +25,21 @@ _ROW_STEP = 32
 _BOUND_TOLERANCE = 1e-8
 """Tolerance of the bounds of a row, multiplied by the row's norm in z if that exceeds 1."""
 _INFEASIBLE_COST = 1e6
-"""Factor of ``WhitenedQp.objective_drop``. Bounds that raise the objective by more count as infeasible."""
+"""Multiple of ``WhitenedQp.objective_drop``. Bounds that raise the objective by more than this are infeasible."""
 
 
 @dataclass(frozen=True)
 class WhitenedQp:
-    """The QP min 1/2 x^T P x + q^T x with rows A, in whitened coordinates z = U^-1 (x - x0), P^-1 = U U^T, with the
-    unconstrained minimum x0: the Hessian is the identity, and the cost is half the squared distance from x0."""
+    """The QP min 1/2 x^T P x + q^T x with constraint rows A, in whitened coordinates.
+
+    The coordinates are z = U^-1 (x - x0), with the unconstrained minimum x0 and P^-1 = U U^T. In z, the Hessian is the
+    identity, and the objective is 1/2 |z|^2 plus its value at x0.
+    """
 
     P: np.ndarray
-    """(n, n)."""
+    """(n, n) Hessian."""
     rows: np.ndarray
-    """(m, n) A."""
+    """(m, n) constraint rows A."""
     root: np.ndarray
     """(n, n) upper triangular U."""
     unit_rows: np.ndarray
@@ -55,9 +58,9 @@ class WhitenedQp:
         """Whiten the QP.
 
         Args:
-            P: (n, n).
-            q: (n,).
-            A: (m, n).
+            P: (n, n) Hessian.
+            q: (n,) linear term.
+            A: (m, n) constraint rows.
 
         Raises:
             numpy.linalg.LinAlgError: P is finite but not positive definite. If P is not finite, the minimum is NaN.
@@ -74,7 +77,7 @@ class WhitenedQp:
         return cls(P, A, root, rows, minimum, A @ minimum, norms, max(1.0, -0.5 * float(q @ minimum)))
 
     def whiten(self, x: np.ndarray) -> np.ndarray:
-        """Return z (n,) of ``x`` (n,)."""
+        """Return the whitened coordinates z (n,) of ``x`` (n,)."""
         return self.root.T @ (self.P @ (x - self.minimum))
 
     @cached_property
@@ -88,9 +91,9 @@ class Optimum:
     """Result of the active-set method."""
 
     x: np.ndarray
-    """(n,)."""
+    """(n,) optimal point."""
     multipliers: np.ndarray
-    """(m,) positive at an active upper bound."""
+    """(m,) multipliers, positive at an active upper bound."""
     feasible: bool
     """True if a point satisfies the bounds; otherwise ``x`` has no meaning."""
 
@@ -158,8 +161,8 @@ def active_set_arrays(rows: int, base_rows: int, unknowns: int, cancelled: wp.ar
 
     Args:
         rows: row capacity.
-        base_rows: number of base rows of which the rows are combinations.
-        unknowns: capacity of unknowns.
+        base_rows: number of base rows; each row is a combination of them.
+        unknowns: maximum number of unknowns.
         cancelled: (1,) int32; the iterations end when it is set.
     """
     zeros = partial(wp.zeros, device=device_of(cancelled))
@@ -185,8 +188,8 @@ def solve_from_guess(
 
     Args:
         qp: the whitened QP.
-        lower: (m,).
-        upper: (m,).
+        lower: (m,) lower bounds of the rows.
+        upper: (m,) upper bounds of the rows.
         at_lower: (m,) bool, guess of the rows at their lower bound.
         at_upper: (m,) bool, guess of the rows at their upper bound.
 

@@ -25,15 +25,15 @@ class Audit:
     cone_violation: float
     """Force outside the friction cone, divided by m g."""
     friction_gap: float
-    """Difference between the work of friction and that of friction at its bound, opposed to the slip; divided by m g
-    H."""
+    """Difference between the actual work of friction and the work of a friction force at its bound that opposes the
+    slip, divided by m g H."""
     contact_velocity: float
     """Difference between the stored end velocities of loaded contacts and their displacements per time step, divided by
     sqrt(g H)."""
     penetration: float
     """Depth of the deepest contact point, divided by H."""
     complementarity_gap: float
-    """Normal force times gap, divided by m g H."""
+    """Normal force times gap at the end of the step, divided by m g H."""
     inverted_elements: int
     """Number of inverted elements, summed over all states."""
     newton_unconverged: int
@@ -84,7 +84,8 @@ def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton
 
 
 def _momentum_residuals(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Return (F, 3) N and (F, 3) N m, rates of change of the two momenta minus external forces and torques."""
+    """Return the residuals of the momentum balances of F steps, (F, 3) N linear and (F, 3) N m angular: rate of change
+    of the momentum minus external forces or torques."""
     mass = t.node_mass.sum()
     com = np.einsum("n,fni->fi", t.node_mass, t.positions) / mass
     momentum = np.einsum("n,fni->fi", t.node_mass, t.velocities)
@@ -127,21 +128,21 @@ def _on_uneven_ground(t: Trajectory) -> np.ndarray:
 
 
 def _contact_normals(t: Trajectory) -> np.ndarray:
-    """Return (C, 3) unit normals: as stored, but recomputed from the heights for uneven ground."""
+    """Return (C, 3) unit normals of the contacts: recomputed from the heights on uneven ground, else as stored."""
     normals, uneven = t.contact_normal.copy(), _on_uneven_ground(t)
     normals[uneven] = _ground(t, _start_points(t)[uneven])[1]
     return normals
 
 
 def _uneven_end_gaps(t: Trajectory) -> np.ndarray:
-    """Return (c,) m, the distance from the ground, at the end of its step, of each contact with uneven ground."""
+    """Return (c,) m, the gaps of the c contacts with uneven ground at the ends of their steps."""
     after = t.contact_step + 1
     ends = np.einsum("cw,cwi->ci", t.contact_weights, t.positions[after[:, None], t.contact_nodes])
     return _ground_gaps(t, ends[_on_uneven_ground(t)])
 
 
 def _ground_gaps(t: Trajectory, points: np.ndarray) -> np.ndarray:
-    """Return (n,) m, distance of ``points`` (n, 3) from the tangent plane of the ground below each."""
+    """Return (n,) m, distance of each of the ``points`` (n, 3) from the tangent plane of the ground below it."""
     lift, normals = _ground(t, points)
     return ((points - t.ground_origin) @ t.ground_axes[2] - lift) * (normals @ t.ground_axes[2])
 
@@ -167,8 +168,8 @@ def _ground(t: Trajectory, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _contact_displacements(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays (C, 3) m: the displacement of each contact in its step, from the stored end velocities and from
-    the positions."""
+    """Return the displacement of each contact in its step twice, (C, 3) m: computed from the stored end velocities, and
+    from the positions."""
     after = t.contact_step + 1
     velocities = np.einsum("cw,cwi->ci", t.contact_weights, t.velocities[after[:, None], t.contact_nodes])
     ends = np.einsum("cw,cwi->ci", t.contact_weights, t.positions[after[:, None], t.contact_nodes])

@@ -1,7 +1,7 @@
 """Steps of many worlds of one body in lockstep on one device, each under prescribed activations.
 
-``BatchStepper.advance`` does what ``LocomotionStepper.advance_with_activations`` does for each world: the same
-equations and the same decisions, in kernels over all worlds and batched matrix products.
+For each world, ``BatchStepper.advance`` solves the same equations and makes the same decisions as
+``LocomotionStepper.advance_with_activations``, with kernels over all worlds and batched matrix products.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ class BatchState(BatchedRecord):
     """State of c worlds and the warm start of their next step."""
 
     worlds: torch.Tensor
-    """(c,) int64, ascending, indices of these worlds among the stepper's."""
+    """(c,) int64, ascending indices of these worlds among all worlds of the stepper."""
     positions: torch.Tensor
-    """(c, N, 3) m."""
+    """(c, N, 3) m, nodal positions."""
     velocities: torch.Tensor
-    """(c, N, 3) m/s."""
+    """(c, N, 3) m/s, nodal velocities."""
     time: torch.Tensor
-    """(c,) s."""
+    """(c,) s, time since the start of the simulation."""
     points: torch.Tensor
     """(c, K) int32, contact points in use; each world uses the first ``counts`` of the K slots."""
     counts: torch.Tensor
     """(c,) int32, number of contact points in use."""
     forces: torch.Tensor
-    """(c, K, 3) N, in the axes of each contact."""
+    """(c, K, 3) N, contact forces in the axes of each contact."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,9 @@ class BatchStep(BatchedRecord):
     """Result of one step of c worlds, on the device."""
 
     after: BatchState
+    """State at the end of the step."""
     report: StepReport
-    """Report of all worlds in tensors with a leading world axis, without timings."""
+    """Report of all worlds, with tensors that have a leading world axis, and without timings."""
 
     @property
     def worlds(self) -> torch.Tensor:
@@ -62,7 +63,7 @@ class BatchStep(BatchedRecord):
         return self.after.worlds
 
     def reports(self) -> list[StepReport]:
-        """Download the step; return one report for each of ``worlds``, like that of a single stepper."""
+        """Download the step; return one report for each of ``worlds``, in the form of ``LocomotionStepper``."""
         reports, counts = self.report.download(), self.after.counts.tolist()
         return [
             replace(report, forces=report.forces[:count], end_gaps=report.end_gaps[:count])
@@ -71,9 +72,9 @@ class BatchStep(BatchedRecord):
 
 
 class BatchStepper:
-    """Stepper of many worlds with one body, one set of muscles and one ground, each with its own friction.
+    """Stepper of many worlds with the same body, muscles and ground. Each world has its own friction.
 
-    It runs on the device on which the body is assembled: a GPU that torch can use too or, in tests, a CPU.
+    It runs on the device of the body's ``assembly``: a GPU that PyTorch supports, or a CPU in tests.
     """
 
     def __init__(
@@ -88,7 +89,7 @@ class BatchStepper:
         chunk_bytes: int = CHUNK_BYTES,
         stages: StageTimer = no_timer,
     ) -> None:
-        """Allocate the buffers that all steps share. Factors take 72 N^2 bytes for each world.
+        """Allocate the buffers that all steps share. The factors take 72 N^2 bytes for each world.
 
         Args:
             body: the body.
@@ -97,9 +98,9 @@ class BatchStepper:
             frictions: (B,) Coulomb coefficient of each world.
             settings: options of the stepper.
             panel: number of columns that are factored at a time.
-            chunk_bytes: bound on the size of the matrices that are factored at a time; several times as much
-                temporary memory is needed in addition.
-            stages: context manager that times each stage.
+            chunk_bytes: maximum total size, in bytes, of the matrices that are factored at a time. The temporary memory
+                takes several times as much in addition.
+            stages: timer of the stages of a step.
         """
         self.settings = settings or LocomotionSettings()
         self.device = torch.device(str(body.assembly.device))
@@ -172,8 +173,8 @@ class BatchStepper:
         """Make a step without muscles and drag, and set the velocities at its end to zero.
 
         Returns:
-            The state; (c,) m, largest displacement of a node along an axis; and (c,) bool, True where a tangent was not
-            positive definite.
+            The state; (c,) m, largest displacement of a node along an axis; and (c,) bool, True where a tangent could
+            not be factored.
         """
         tensions = self._stiffness.new_zeros((len(state.worlds), len(self._stiffness)))
         inputs, previous_forces = self._start(state, tensions, dt, 0.0)
@@ -190,16 +191,16 @@ class BatchStepper:
     def advance(
         self, state: BatchState, activations: np.ndarray | torch.Tensor, dt: float
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
-        """Make one step of ``dt`` s; repeat it as half steps for the worlds in which it does not converge.
+        """Make one step of ``dt`` seconds. Where it does not converge, make shorter steps instead.
 
         Args:
             state: worlds to step.
-            activations: (c, M) m.
+            activations: (c, M) m, muscle activations.
             dt: step size, s.
 
         Returns:
-            State of the worlds that were solved; their steps in chronological order; and (c,) bool, True for worlds of
-            ``state`` for which not even a part of the step was solved.
+            The state of the solved worlds; their steps in chronological order; and (c,) bool, True for failed worlds of
+            ``state``: a tangent could not be factored, or no part of the step converged.
         """
         with torch.no_grad(), torch_stream(self.device):
             on_device = torch.as_tensor(activations, dtype=torch.float64, device=self.device)
@@ -219,8 +220,8 @@ class BatchStepper:
     def _parts(
         self, state: BatchState, activations: torch.Tensor, dt: float, max_halvings: int
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
-        """Make a step of ``dt`` s. In worlds in which it does not converge, make two half steps instead; a step is
-        halved up to ``max_halvings`` times.
+        """Make a step of ``dt`` seconds. In worlds in which it does not converge, make two half steps instead. A step
+        is halved up to ``max_halvings`` times.
 
         Returns:
             State of the solved worlds, their steps, and (c,) bool, True for failed worlds.
@@ -242,8 +243,8 @@ class BatchStepper:
         return _merged(after, half), done, failed
 
     def _step(self, state: BatchState, activations: torch.Tensor, dt: float) -> tuple[BatchStep, torch.Tensor]:
-        """Make one step of all worlds, as ``LocomotionStepper.step_with_activations`` does; also return (c,) bool, True
-        where a tangent was not positive definite."""
+        """Make one step of all worlds, as ``LocomotionStepper.step_with_activations`` does. Also return (c,) bool, True
+        where a tangent could not be factored."""
         with self._stages("detect"):
             inputs, previous_forces = self._start(state, self._stiffness * activations, dt, self.settings.drag)
         response, velocities, forces, failed = self._predict(inputs, previous_forces)
@@ -258,7 +259,7 @@ class BatchStepper:
         """Detect the contacts of a step of ``dt`` seconds under muscle ``tensions`` (c, M) N.
 
         Returns:
-            Inputs of the solve, and (c, K, 3) N, the forces of the contacts in the previous step.
+            Inputs of the solve, and (c, K, 3) N, the forces that these contacts had in the previous step.
         """
         problem = BatchProblem.at(self.common, state.worlds, state.positions, state.velocities, dt=dt, drag=drag)
         gaps, _ = self.detector.gaps_of_worlds(problem.ballistic_positions)
@@ -275,8 +276,8 @@ class BatchStepper:
         """Predict the end of the step in all worlds, as ``LocomotionStepper.predict`` does.
 
         Returns:
-            Contact linearisation, velocities (c, N, 3) m/s, forces (c, K, 3) N, and (c,) bool, True where a tangent was
-            not positive definite.
+            Contact linearisation, velocities (c, N, 3) m/s, forces (c, K, 3) N, and (c,) bool, True where a tangent
+            could not be factored.
         """
         solver, stages, problem = self.solver, self._stages, inputs.problem
         velocities = problem.rigid_guess.clone()

@@ -1,8 +1,8 @@
 """QP of a step with the activations as its only unknowns, under exact Coulomb contact, and the search over contact
 modes (Eq. 9, 13).
 
-Contact forces are a function of the activations, affine in each region of fixed contact modes. ``search_modes`` solves
-one QP in each region that it visits; ``device_search`` is the version in one kernel. See
+Contact forces are a function of the activations that is affine in each region of fixed contact modes. ``search_modes``
+solves one QP in each region that it visits; ``device_search`` runs the same search in one kernel. See
 docs/concepts/locomotion.md#modes.
 """
 
@@ -21,13 +21,13 @@ from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 FREE, STICK, SLIDE = kernels.FREE, kernels.STICK, kernels.SLIDE
 _getrf, _getrs = get_lapack_funcs(("getrf", "getrs"), dtype=np.float64)
 _MIN_PIVOT = 1e-14
-"""Smallest pivot of the equations of the forces, as a fraction of the largest."""
+"""Minimum pivot of the equations for the contact forces, as a fraction of their largest pivot."""
 
 
 @dataclass(frozen=True)
 class CoulombProgram:
-    """Problem min 1/2 x^T P x + q^T x + constant over x = (a, f), where f are the exact Coulomb forces that follow from
-    a.
+    """Problem min 1/2 x^T P x + q^T x + constant over x = (a, f), where f are the exact Coulomb forces for the
+    activations a.
 
     Activations are fractions of their bounds, forces are in body weights (for each contact normal, then two tangential
     components), speeds in sqrt(g H). Contact velocities are ``rows`` x + ``offset``; their normal components include
@@ -35,15 +35,17 @@ class CoulombProgram:
     """
 
     P: np.ndarray
-    """(m + 3n, m + 3n)."""
+    """(m + 3n, m + 3n) Hessian of the objective."""
     q: np.ndarray
-    """(m + 3n,)."""
+    """(m + 3n,) linear term of the objective."""
     constant: float
+    """Constant term of the objective."""
     rows: np.ndarray
-    """(3n, m + 3n)."""
+    """(3n, m + 3n) derivative of the contact velocities with respect to x."""
     offset: np.ndarray
-    """(3n,)."""
+    """(3n,) contact velocities at x = 0."""
     friction: float
+    """Coulomb coefficient mu."""
     lower: np.ndarray
     """(m,) lower bounds of the activations."""
     upper: np.ndarray
@@ -77,9 +79,9 @@ class PredictedContact:
     """Predicted contact of a step (Eq. 12) in the units of the QP."""
 
     activations: np.ndarray
-    """(M,) as fractions of their bounds."""
+    """(M,) muscle activations, as fractions of their bounds."""
     forces: np.ndarray
-    """(n, 3) body weights: normal and two tangential components of each contact."""
+    """(n, 3) contact forces in body weights: normal and two tangential components of each contact."""
     velocities: np.ndarray
     """(n, 3) in sqrt(g H), contact velocities at the predicted end."""
 
@@ -110,10 +112,11 @@ class ModeRegionOptimum:
     x: np.ndarray
     """(m + 3n,) activations and contact forces (a, f), as in ``CoulombProgram``."""
     objective: float
+    """Objective at ``x``."""
     contact: np.ndarray
     """(k,) contact of each active mode constraint that raises the objective."""
     transition: np.ndarray
-    """(k,) transition of that contact beyond the constraint, as in ``ModeRegion``."""
+    """(k,) transition that the contact makes beyond the constraint, as in ``ModeRegion``."""
     multiplier: np.ndarray
     """(k,) multiplier of the constraint, positive."""
 
@@ -123,7 +126,7 @@ class ModeSearchResult:
     """Best point of a mode search."""
 
     x: np.ndarray | None
-    """(m + 3n,); None if no QP had a solution."""
+    """(m + 3n,) activations and contact forces (a, f); None if no QP had a solution."""
     objective: float
     """Objective at ``x``; infinite if ``x`` is None."""
     qp_count: int
@@ -141,12 +144,12 @@ def search_modes(
     solver: QpSolver | str,
 ) -> ModeSearchResult:
     """Search over contact modes: solve the QP of a region, continue in the region beyond its active mode constraints,
-    and repeat while the objective falls.
+    and repeat while the objective decreases.
 
-    The optimum of a region lies on its boundary with the next one, so each QP has a feasible start. The search begins
-    with the sliding contacts of ``modes`` set to stick, and with ``modes`` themselves if that region has no solution:
-    feet that slide apart under load resist only in one direction each, and from there the search does not reach a
-    common push-off.
+    The optimum of a region lies on its boundary with the next region, so each QP has a feasible start. The search
+    begins in the region in which the sliding contacts of ``modes`` stick. The reason: a sliding foot resists in one
+    direction only, and from a region in which the feet slide apart the search does not reach a push-off with all feet.
+    If the first region has no solution, the search begins in the region of ``modes`` itself.
 
     Args:
         program: the QP of the step.
@@ -169,7 +172,8 @@ def search_modes(
             modes = sliding_modes
             continue
         if best is not None and solution.objective >= best.objective:
-            # All transitions together raised the objective; the one with the largest multiplier may still lower it.
+            # All transitions together raised the objective. The transition with the largest multiplier alone may still
+            # lower it.
             if single is None or modes is single:
                 break
             modes = single
@@ -185,8 +189,10 @@ def search_modes(
 
 
 def solve_relaxed(program: CoulombProgram, solver: QpSolver | str) -> tuple[np.ndarray, float] | None:
-    """Solve the relaxed QP over activations and forces: forces within the friction cone, and no complementarity, so
-    that a force may act where nothing touches. Its optimum is a lower bound on the objective in every mode region.
+    """Solve the relaxed QP over activations and contact forces.
+
+    Forces must lie in the friction cone, but complementarity is dropped, so a force may act at an open contact. The
+    optimum is a lower bound on the objective in every mode region.
 
     Returns:
         The activations (m,) and the objective, or None without a solution.
@@ -195,7 +201,7 @@ def solve_relaxed(program: CoulombProgram, solver: QpSolver | str) -> tuple[np.n
     forces = np.hstack([np.zeros((3 * n, m)), np.eye(3 * n)])
     cone = [forces[::3]]
     for angle in 2.0 * np.pi * np.arange(kernels.CONE_FACES) / kernels.CONE_FACES:
-        # A pyramid around the cone, because a lower bound must not exclude points of the cone.
+        # The pyramid encloses the cone, because a lower bound must not exclude points of the cone.
         cone.append(program.friction * forces[::3] - np.cos(angle) * forces[1::3] - np.sin(angle) * forces[2::3])
     A = np.vstack([np.eye(m, m + 3 * n), *cone, program.rows[::3]])
     lower = np.concatenate([program.lower, np.zeros(n * (1 + kernels.CONE_FACES)), -program.offset[::3]])
@@ -219,8 +225,8 @@ class FrictionDirections:
 
     @classmethod
     def pyramid(cls, directions: int, first: float, sector: float) -> FrictionDirections:
-        """Return a pyramid inside the cone with ``directions`` faces, of which the first is at the angle ``first`` in
-        radians."""
+        """Return directions with a pyramid of ``directions`` faces inside the cone, of which the first is at the angle
+        ``first`` in radians, and with the given ``sector``."""
         angles = [first + 2.0 * math.pi * face / directions for face in range(directions)]
         width = math.cos(math.pi / directions)
         return cls(np.array([(width, -math.cos(angle), -math.sin(angle)) for angle in angles]), sector)
@@ -240,21 +246,21 @@ class ModeRegion:
     """
 
     force_offset: np.ndarray
-    """(3n,) body weights."""
+    """(3n,) body weights, contact forces at a = 0."""
     force_slope: np.ndarray
-    """(3n, m)."""
+    """(3n, m) body weights, derivative of the contact forces."""
     P: np.ndarray
-    """(m, m)."""
+    """(m, m) Hessian of the cost."""
     q: np.ndarray
-    """(m,)."""
+    """(m,) linear term of the cost."""
     rows: np.ndarray
     """(m + k, m): m rows of the activations themselves, then k mode constraints."""
     rows_offset: np.ndarray
-    """(m + k,)."""
+    """(m + k,) values of these rows at a = 0."""
     contact: np.ndarray
     """(k,) contact of each mode constraint."""
     transitions: np.ndarray
-    """(k,) transition of that contact where the constraint is violated: ``TO_FREE``, ``TO_SLIDE``,
+    """(k,) transition that the contact makes if the constraint is violated: ``TO_FREE``, ``TO_SLIDE``,
     ``TO_OTHER_DIRECTION`` or ``TO_TOUCHING``."""
 
     @classmethod
@@ -303,10 +309,11 @@ class ModeRegion:
 
 def _forces(program: CoulombProgram, modes: ContactModes, stick: np.ndarray, slide: np.ndarray) -> np.ndarray | None:
     """Return the contact forces (3n, m + 1) as an affine function of the activations, with the constant in the last
-    column: those that keep sticking contacts at rest and sliding ones on the ground. None if they are singular."""
+    column. They keep sticking contacts at rest and sliding contacts closed. None if their equations are singular."""
     m, n = program.activation_count, program.contact_count
     held = np.concatenate([(3 * stick[:, None] + np.arange(3)).ravel(), 3 * slide])
-    # Forces per component that holds a velocity at zero; friction of a sliding contact follows its normal force.
+    # Map from the solved components, each of which keeps one velocity at zero, to all forces. The friction of a sliding
+    # contact is proportional to its normal force.
     spread = np.zeros((3 * n, len(held)))
     spread[held, np.arange(len(held))] = 1.0
     normals = np.arange(3 * len(stick), len(held))
@@ -337,7 +344,8 @@ def solve_mode_region(
 ) -> ModeRegionOptimum | None:
     """Solve the QP of the activations in the region of ``modes``.
 
-    Mode constraints that ``start`` violates by up to ``max_violation`` may stay violated by as much.
+    If ``start`` violates a mode constraint, the optimum may violate it by the same amount, but at most by
+    ``max_violation``.
 
     Args:
         program: the QP of the step.
@@ -345,8 +353,9 @@ def solve_mode_region(
         modes: modes of the region.
         solver: QP solver, see ``quadratic_program``.
         friction: directions that approximate the friction cone.
-        max_violation: largest violation that is tolerated, a force in body weights or a speed in sqrt(g H).
-        warm_start: True if another region of the step has been solved; skips operator splitting (``SplittingProgram``).
+        max_violation: maximum tolerated violation, a force in body weights or a speed in sqrt(g H).
+        warm_start: True if another region of the step has been solved; operator splitting is then skipped
+            (``SplittingProgram``).
 
     Returns:
         The optimum, or None without a solution.
@@ -375,8 +384,8 @@ def solve_mode_region(
 def _next_modes(
     program: CoulombProgram, modes: ContactModes, optimum: ModeRegionOptimum
 ) -> tuple[ContactModes, ContactModes | None]:
-    """Return the modes beyond all active constraints of ``optimum`` in the region of ``modes``, and the modes beyond
-    the constraint with the largest multiplier alone; the latter are None if only one constraint is active."""
+    """Return the modes beyond all active constraints of ``optimum``, which lies in the region of ``modes``, and the
+    modes beyond its constraint with the largest multiplier alone; the second is None if only one is active."""
     neighbours = _NextModes(program, modes, optimum.x)
     constraints = optimum.contact, optimum.transition, optimum.multiplier
     after_all = neighbours.after_transitions(*constraints)

@@ -1,6 +1,6 @@
-"""Linear steps on a GPU, on the device of the contact linearisation: their columns are never downloaded (Eq. 7, 8, 13).
+"""Linear steps on the GPU of the contact linearisation. Their columns are never downloaded (Eq. 7, 8, 13).
 
-The arithmetic is torch on the device, recorded as CUDA graphs.
+PyTorch computes them; the operations are recorded as CUDA graphs.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class DeviceLinearStep(LinearStep):
         return self.host_contact_velocities
 
     def objective_quadratic(self, objectives: Sequence[Objective]) -> Callable[[], np.ndarray]:
-        """Start computing the quadratic form of the weighted squares of ``objectives``, see ``LinearStep``. A later
-        call discards the result of an earlier one."""
+        """Start computing the quadratic form of the weighted squares of ``objectives``, see ``LinearStep``. The next
+        call overwrites the result."""
         stream, width = self.response.owner.stream, self.count + 1
         with stream:
             self.square_staging.start_download(
@@ -122,7 +122,7 @@ class StagingBuffer:
         self._stream, self._upload, self._download = stream, PinnedUpload(stream, 0), stream.pinned(0)
 
     def upload(self, *parts: np.ndarray) -> torch.Tensor:
-        """Upload the concatenated ``parts``; return them on the device."""
+        """Upload the concatenated ``parts``; return them as one flat tensor on the device."""
         count = sum(part.size for part in parts)
         if len(self._upload.host) < count:
             self._upload = PinnedUpload(self._stream, 2 * count)
@@ -136,7 +136,7 @@ class StagingBuffer:
         self._download[: len(values)].copy_(values, non_blocking=True)
 
     def result(self, count: int) -> np.ndarray:
-        """Return the first ``count`` entries that were downloaded; synchronise the stream first."""
+        """Return the first ``count`` downloaded entries; the caller must synchronise the stream first."""
         return self._download.numpy()[:count]
 
 
@@ -154,8 +154,8 @@ class DeviceLinearSteps:
         self._staging = StagingBuffer(owner.stream), StagingBuffer(owner.stream)
 
     def linearize(self, predicted: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
-        """Linearise the step about ``predicted``; the next call overwrites the result. ``other`` runs last, because
-        both use one stream."""
+        """Linearise the step about ``predicted``; the next call overwrites the result. ``other`` runs afterwards,
+        because both use the same stream."""
         response, owner, m = predicted.linearization, self.owner, self.count
         assert isinstance(response, DeviceContactLinearization)
         newton, dt = response.workspace, response.tangent.problem.dt
@@ -188,8 +188,8 @@ class DeviceLinearSteps:
         return velocities, self._host_buffer[: rows * width].view(rows, width)
 
     def segment_forces(self, newton: NewtonWorkspace) -> torch.Tensor:
-        """Return (M, 3) N, the forces with which the segments, activated at their bounds, pull their ends together at
-        the end of the last trial of ``newton``."""
+        """Return (M, 3) N, the forces by which the segments pull their ends together if they are activated at their
+        bounds, at the end positions of the last trial of ``newton``."""
         return wp.to_torch(
             self.owner.muscle_segments.enqueue_segment_forces(
                 as_warp(self._tensions, real), vectors(newton.end_positions)
@@ -197,8 +197,8 @@ class DeviceLinearSteps:
         )[0]
 
     def write(self, newton: NewtonWorkspace, segment_forces: torch.Tensor, dt: float, velocities: torch.Tensor) -> None:
-        """Write ``LinearStep.velocities`` about the last trial of ``newton``, which must be one without muscles
-        (Eq. 7).
+        """Write ``LinearStep.velocities`` about the last trial of ``newton``, which must have been evaluated without
+        muscles (Eq. 7).
 
         Args:
             newton: workspace of the Newton loop.

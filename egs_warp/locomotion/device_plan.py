@@ -1,8 +1,8 @@
 """The plan of a step on a GPU: prediction, QP, search and start of the solve, with one read-back (Eq. 4, 7, 8, 9, 12,
 13).
 
-It does the work of ``LocomotionStepper.predict`` and ``StepPlanner.plan`` in the nominal case, as CUDA graphs of torch
-and Warp. In other cases it returns None and the host plans the step. Its kernels are in
+In the nominal case it does the work of ``LocomotionStepper.predict`` and ``StepPlanner.plan``, as CUDA graphs of
+PyTorch and Warp operations. In other cases it returns None, and the host plans the step. Its kernels are in
 ``egs_warp.kernels.locomotion.step_program``, ``mode_search`` and ``relaxed_contact``.
 """
 
@@ -41,7 +41,8 @@ from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.precision import real
 
 PARALLEL_RESTART_COST = 0.5 * RESTART_COST
-"""If a step costs at least this, the next step runs its restart concurrently with the first search."""
+"""If the objective value of a step is at least this, the next step runs its restart concurrently with the first search.
+"""
 
 
 class DevicePlanner:
@@ -76,8 +77,8 @@ class DevicePlanner:
         self._workspaces: dict[int, PlanWorkspace] = {}
 
     def start(self, start: StepInputs) -> None:
-        """Start the part of ``plan`` that does not depend on the objectives, asynchronously: prediction and linear
-        step."""
+        """Start the prediction and the linear step, the part of ``plan`` that does not depend on the objectives,
+        asynchronously."""
         self._workspace_for(start).start(start)
 
     def plan(self, start: StepInputs, objectives: Sequence[AnyObjective]) -> tuple[ContactLinearization, Plan] | None:
@@ -107,7 +108,7 @@ class DevicePlanner:
             friction: Coulomb coefficient.
 
         Returns:
-            The plan; None as for ``plan``, or if the device no longer holds that end.
+            The plan; None in the same cases as ``plan``, or if the device no longer holds the end of the solve.
         """
         response = predicted.linearization
         assert isinstance(response, DeviceContactLinearization)
@@ -142,7 +143,7 @@ class PlanWorkspace:
             self._input.device.split(parts)
         )
         self._bounds = bounds.view(3, m)
-        # Trial inputs: evaluate the iterate of a slot, and make a Newton step from the last trial.
+        # Trial inputs that evaluate the iterate in a slot, or make a Newton step from the last trial.
         self._evaluate_input = {
             base: body.tensor(np.array([0.0, 0.0, base])) for base in (FROM_BASE, FROM_TRIAL, FROM_START)
         }
@@ -150,7 +151,7 @@ class PlanWorkspace:
         self._velocities, self._contact_velocities = zeros(size, m + width + 1), zeros(width, m + width + 1)
         self._form = zeros(m + width + 1, m + width + 1)
         self._entries, self._gradient, self._energy = zeros(len(owner.factors.places)), zeros(size), zeros(1)
-        # The read-back in one array: checks of the prediction and of the search, its result, forces, end.
+        # The read-back is one array: checks of the prediction and of the search, result of the search, forces, and end.
         lengths = [
             4,
             PREDICTION_ITERATIONS + 2,
@@ -181,7 +182,7 @@ class PlanWorkspace:
         self._relaxed = RelaxationWorkspace(m, capacity, self._search)
         self._second = ModeSearchWorkspace(m, capacity, alias, first_search=self._search)
         self._objective, self._is_restart_parallel = 0.0, False
-        # Contact forces at the start of the second search and their violation, which is ignored there.
+        # Contact forces at the start of the second search, and their violation of Coulomb's law, which is not checked.
         self._restart_forces, self._restart_violation = zeros(width), zeros(1)
         # 1 if the solve starts from the end of the first search.
         self._starts_solve = torch.zeros(1, dtype=torch.int32, device=body.factors.device)
@@ -205,7 +206,7 @@ class PlanWorkspace:
         body.predicted_start = start
 
     def plan(self, start: StepInputs, objectives: Sequence[AnyObjective]) -> tuple[ContactLinearization, Plan] | None:
-        """Plan the step that was started; see ``DevicePlanner.plan``."""
+        """Plan the step for which ``start`` was called; see ``DevicePlanner.plan``."""
         body, newton, problem = self.body, self.newton, start.problem
         body.predicted_start = None
         self._start_search(start, objectives)
@@ -243,8 +244,8 @@ class PlanWorkspace:
         self.owner.factors.mark_started()
 
     def _start_search(self, start: StepInputs, objectives: Sequence[AnyObjective]) -> None:
-        """Build the QP about the linear step and search it. The solve starts on the device at once if the result is
-        accepted."""
+        """Build the QP about the linear step and run the mode search on it. If the result is accepted, the solve starts
+        on the device at once."""
         dt, ratio = start.problem.dt, start.problem.inertia_ratio
         with self.body.stream:
             self._write_objectives(start, objectives)
@@ -253,12 +254,12 @@ class PlanWorkspace:
         self._start_solve(start, self._starts_solve)
 
     def _horizon(self, dt: float) -> float:
-        """Return the duration of ``EffortModel``, s."""
+        """Return the time horizon of ``EffortModel``, s."""
         return max(EFFORT_HORIZON * self.body.body.time_unit, dt)
 
     def _build_plan(self, start: StepInputs, response: DeviceContactLinearization) -> Plan | None:
-        """Build the plan from the result of the search, or of a restart if its cost is high; return None if a check
-        failed."""
+        """Build the plan from the result of the search; if its objective is high, from the better of this result and
+        the result of a restart. Return None if a check failed."""
         *_, (definite, residual_norm, coulomb_violation), search_result, _, forces, contact_velocities, velocities = (
             self._parts
         )
@@ -294,7 +295,7 @@ class PlanWorkspace:
         return Plan(activations, end.velocities, end.forces, int(count), int(infeasible))
 
     def _search_with_restart(self, result: ModeSearchResult, contacts: int) -> ModeSearchResult:
-        """Return ``result``, or the better result of a restart if its objective is high."""
+        """Return ``result``; if its objective is high, run a restart and return the better of both results."""
         if not needs_restart(result.objective, contacts):
             return result
         relaxed_on_device = self._relaxed.parse_result() if self._is_restart_parallel else None
@@ -315,14 +316,14 @@ class PlanWorkspace:
         return restart_from_relaxation(result, relaxed, search)
 
     def _search_on_host(self, search: ModeSearchWorkspace) -> ModeSearchResult:
-        """Repeat the search of ``search`` on the host, after a numerical failure of the kernel."""
+        """Repeat the search in the workspace ``search`` on the host, after a numerical failure of the kernel."""
         program, start, modes = search.parse_input()
         limit = self.owner.planner.settings.qp_limit
         return search_modes(program, start, modes, qp_limit=limit, solver=QpSolver.OSQP)
 
     def _enqueue_restart(self) -> None:
-        """Queue the relaxed optimum and a search from there."""
-        # Warp launches on torch's stream.
+        """Queue the solve for the relaxed optimum, and a search that starts from it."""
+        # Make Warp launch on PyTorch's current stream.
         with wp.ScopedStream(self.body.stream.current(), sync_enter=False):
             self._relaxed.enqueue()
             self._enqueue_from(wp.to_torch(self._relaxed.packed_result)[HEADER_SIZE:])
@@ -332,7 +333,7 @@ class PlanWorkspace:
         self._enqueue_from(self._uploaded_point.device[: self.m])
 
     def _enqueue_from(self, activations: torch.Tensor) -> None:
-        """Queue the second search, from ``activations`` (m,) and the contact forces that follow from them."""
+        """Queue the second search, from ``activations`` (m,) and the contact forces that they cause."""
         body, newton = self.body, self.newton
         contact_free = torch.addmv(self._contact_velocities[:, -1], self._contact_velocities[:, : self.m], activations)
         self._restart_forces.copy_(self._predicted_forces)
@@ -353,8 +354,8 @@ class PlanWorkspace:
         self._second.enqueue()
 
     def _replace_end(self, x: np.ndarray, start: StepInputs) -> None:
-        """Replace the expected end by that of ``x`` (m + 3n,), the result of another search, and start the solve
-        there."""
+        """Replace the expected end of the step by the end for ``x`` (m + 3n,), the result of another search, and start
+        the solve there."""
         body, problem = self.body, start.problem
         with body.stream:
             self._uploaded_point.set(x, np.zeros(len(self._x) - 1 - len(x)), np.ones(1))
@@ -363,8 +364,8 @@ class PlanWorkspace:
         self._start_solve(start)
 
     def _start_solve(self, start: StepInputs, enabled: torch.Tensor | None = None) -> None:
-        """Start the solve, and wait for the plan, which was queued before. ``enabled`` (1,) int32 on the device: 0
-        skips the solve."""
+        """Queue the solve, and block until the plan, which was queued before it, is finished. If ``enabled`` (1,) int32
+        on the device is 0, the solve is skipped."""
         with self.body.stream:
             self._plan_event = self.body.stream.record_event(self._plan_event)
         progress = self.owner.progress(start.problem)
@@ -379,7 +380,8 @@ class PlanWorkspace:
         self._graphs.run((work.__name__, *arguments), lambda: work(*arguments))
 
     def _upload_inputs(self, start: StepInputs, activations: np.ndarray) -> None:
-        """Upload all data that are known at the start of a step. The search begins at ``activations`` (M,) m."""
+        """Write all data that are known at the start of a step to the uploads. The search begins at ``activations``
+        (M,) m."""
         problem, planner, newton = start.problem, self.owner.planner, self.newton
         newton.coulomb.upload(start.normal_bias, start.friction)
         self.owner.factors.upload_diagonal(self.owner.masses)
@@ -398,7 +400,8 @@ class PlanWorkspace:
         )
 
     def _enqueue_prediction(self, dt: float, ratio: float) -> None:
-        """Queue the prediction: one Newton step under the known forces, then ``PREDICTION_ITERATIONS`` with contact."""
+        """Queue the prediction: a Newton step with the contact forces of the previous step, and then
+        ``PREDICTION_ITERATIONS`` Newton steps that solve Coulomb's law."""
         body, newton = self.body, self.newton
         self._input.send()
         velocities, _, _, forces = newton.parts(newton.start_buffer)
@@ -423,7 +426,8 @@ class PlanWorkspace:
             self._coulomb_violations[iteration].copy_(newton.coulomb_violation[0])
 
     def _enqueue_factors(self, dt: float, which: int) -> None:
-        """Queue the factorisation of the step's matrix at the end of the last trial."""
+        """Queue the factorisation of the system matrix at the end of the last trial; ``which`` is the slot of its
+        verdict."""
         self.body.enqueue_factors(vectors(self.newton.end_positions), dt)
         self._verdicts[which].copy_(self.body.factors.verdict)
 
@@ -450,7 +454,7 @@ class PlanWorkspace:
         self._contact_velocities.copy_(newton.contact_velocities(self._velocities))
 
     def _write_objectives(self, start: StepInputs, objectives: Sequence[AnyObjective]) -> None:
-        """Write the quadratic form of the ``objectives`` in (x, 1), see ``objectives_cost``."""
+        """Write the quadratic form of the ``objectives`` in (x, 1) to ``_form``, see ``objectives_cost``."""
         problem, m, speed = start.problem, self.m, self.body.body.speed_unit
         plain = [each for each in objectives if isinstance(each, Objective)]
         torch.mul(objective_form(self._velocities, plain, self.owner.objective_staging), 1.0 / speed**2, out=self._form)
@@ -468,8 +472,9 @@ class PlanWorkspace:
             self._form.addmm_(rows.T, rows)
 
     def _enqueue_search(self, dt: float, ratio: float, time: float, is_parallel: bool) -> None:
-        """Queue the QP, its search, a restart concurrently with it if ``is_parallel``, and the residual of the step at
-        the expected end."""
+        """Queue the QP, the search, and the residual of the step at the expected end. If ``is_parallel``, a restart
+        runs concurrently with the search.
+        """
         body, newton, planner = self.body, self.newton, self.owner.planner
         width, coulomb = 3 * newton.capacity, newton.coulomb
         self._predicted_forces.copy_(newton.target_forces)
@@ -511,7 +516,7 @@ class PlanWorkspace:
         self._enqueue_end(dt, ratio)
 
     def _enqueue_end(self, dt: float, ratio: float) -> None:
-        """Queue the contact forces that follow from the activations of x, the expected end, and its residual."""
+        """Queue the contact forces for the activations in x, the expected end of the step, and its residual."""
         body, newton, owner = self.body, self.newton, self.owner
         activations = self._x[: self.m]
         contact_free = torch.addmv(self._contact_velocities[:, -1], self._contact_velocities[:, : self.m], activations)
@@ -532,7 +537,7 @@ class PlanWorkspace:
         self._host_readback.copy_(self._readback, non_blocking=True)
 
     def _enqueue_cost(self, dt: float, time: float) -> None:
-        """Queue the addition of effort and activation costs to the form, see ``effort_cost`` and ``StepPlanner``."""
+        """Queue the addition of effort and activation costs to ``_form``, see ``effort_cost`` and ``StepPlanner``."""
         body, newton, owner, form = self.body, self.newton, self.owner, self._form
         unit = EFFORT_WEIGHT / (body.body.weight * body.body.height)
         reference = dt * newton.trial_parts()[0]

@@ -48,9 +48,9 @@ def search_modes_device(
 class ModeSearchWorkspace:
     """Buffers and recorded launch of ``mode_search_kernel`` for at most ``m`` activations and ``n`` contacts.
 
-    ``packed_qp`` is the input and ``packed_result`` the output, both documented at the kernel. ``is_accepted`` (1,)
-    int32 is set as soon as the search has a result that costs less than ``restart_cost``. If ``first_search`` is given,
-    this search runs concurrently with it and ends once that has set its ``is_accepted``.
+    ``packed_qp`` is the input and ``packed_result`` the output; the kernel documents their layouts. ``is_accepted``
+    (1,) int32 is set as soon as the search has a result whose objective is below ``restart_cost``. If ``first_search``
+    is given, this search runs concurrently with the first search and ends once the latter sets its ``is_accepted``.
     """
 
     def __init__(
@@ -116,11 +116,11 @@ class ModeSearchWorkspace:
         return PinnedMirror(self.packed_result)
 
     def enqueue(self) -> None:
-        """Queue the search; returns at once."""
+        """Queue the search, asynchronously."""
         self._launch.launch()
 
     def parse_input(self) -> tuple[CoulombProgram, np.ndarray, ContactModes]:
-        """Return the contents of ``packed_qp``: the QP, activations (m,) of the start, and the modes there."""
+        """Return the contents of ``packed_qp``: the QP, the activations (m,) at the start, and the modes there."""
         packed = self.packed_qp.numpy()
         m, n = int(packed[0]), int(packed[1])
         size = m + 3 * n
@@ -162,9 +162,11 @@ class ModeSearchWorkspace:
 
 
 class RelaxationWorkspace:
-    """Buffers and recorded launch of ``relaxed_qp_kernel``, the relaxed optimum of the QP in ``search.packed_qp``, for
-    at most ``m`` activations and ``n`` contacts. It ends early once ``search`` has set ``is_accepted``.
-    ``packed_result`` is the output, documented at the kernel."""
+    """Buffers and recorded launch of ``relaxed_qp_kernel`` for at most ``m`` activations and ``n`` contacts.
+
+    The kernel computes the relaxed optimum of the QP in ``search.packed_qp`` and writes it to ``packed_result``, whose
+    layout it documents. It ends early once ``search`` has set ``is_accepted``.
+    """
 
     def __init__(self, m: int, n: int, search: ModeSearchWorkspace) -> None:
         device, size, row_capacity = device_of(search.packed_qp), m + 3 * n, m + (2 + CONE_FACES) * n
@@ -186,14 +188,15 @@ class RelaxationWorkspace:
         return PinnedMirror(self.packed_result)
 
     def enqueue(self) -> None:
-        """Queue the launch; returns at once."""
+        """Queue the launch, asynchronously."""
         self._launch.launch()
 
     def parse_result(self) -> tuple[np.ndarray, float] | None:
         """Download the activations and the objective of the relaxed optimum, as in ``solve_relaxed``; return None on
         numerical failure, or if the search was accepted first."""
         packed_result = self._host_result.get()
-        # Large enough forces always prevent penetration, so the relaxed QP is feasible: other statuses are failures.
+        # Large enough forces always prevent penetration, so the relaxed QP is feasible and any other status is a
+        # failure.
         return (
             (packed_result[kernels.HEADER_SIZE :], float(packed_result[1]))
             if packed_result[0] == OPTIMUM_FOUND

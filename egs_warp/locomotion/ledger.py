@@ -53,7 +53,7 @@ class EnergyBalance:
     muscles: np.ndarray
     """(F,) work of muscles, sum of T (L before - L after)."""
     pushes: np.ndarray
-    """(F,) energy of the velocities that external pushes add at the start of the step."""
+    """(F,) kinetic energy that external pushes add at the start of the step."""
     damping: np.ndarray
     """(F,) dissipation of the material."""
     drag: np.ndarray
@@ -79,8 +79,8 @@ class EnergyBalance:
     spin_after: np.ndarray
     """(F,) kinetic energy of the rotation that is added to the velocities after the step, for the same purpose."""
     muscle_work: np.ndarray
-    """(F,) sum of max(0, T (L before - L after)): positive work of muscles, without that absorbed by stretched ones;
-    not a flow."""
+    """(F,) sum of max(0, T (L before - L after)): positive work of the muscles that shorten. It is not one of
+    ``FLOWS``."""
 
     @property
     def stored(self) -> np.ndarray:
@@ -110,11 +110,11 @@ class EnergyTotals:
     flows: Mapping[str, float]
     """Sum of each of ``FLOWS``."""
     change: float
-    """Stored energy of the last state minus that of the first."""
+    """Stored energy of the last state minus stored energy of the first state."""
     peak_deformation: float
-    """Largest kinetic energy of deformation."""
+    """Maximum kinetic energy of deformation."""
     peak_elastic: float
-    """Largest elastic energy."""
+    """Maximum elastic energy."""
     worst_residual: float
     """Largest absolute residual of a step."""
 
@@ -167,13 +167,13 @@ def _flows(t: Trajectory, body: _Elements, muscles: _Muscles, step: int) -> tupl
     before, after = t.positions[step], t.positions[step + 1]
     displacements = after - before
     kick = t.kick_velocity[t.kick_step == step].sum(axis=0) if len(t.kick_step) else np.zeros_like(displacements)
-    # Velocity in the equation of motion; the stored one may include an added rotation.
+    # Velocity in the equation of motion. The stored velocity may include an added rotation.
     velocity = displacements / dt
     element_result = body.step(before, after, dt)
     muscle_result = muscles.step(t.activations[step], before, after)
     added = _spin(mass, after, t.velocities[step + 1] - velocity)
-    # Internal forces have no net torque at the end of the step, but implicit Euler applies them, in their directions at
-    # the end, with the lever arms at the start.
+    # The internal forces at the end of the step have no net torque there, but implicit Euler applies them with the
+    # lever arms at the start of the step.
     lost_momentum = -dt * (element_result.torque + muscle_result.torque)
     inner_spin = np.linalg.solve(_inertia(mass, before), lost_momentum - _inertia(mass, after) @ added)
     friction, contact, push_out = _contacts(t, step, displacements)
@@ -217,7 +217,7 @@ class _Strain:
     lost_elastic: float
     lost_damping: float
     torque: np.ndarray
-    """(3,) N m, torque of the elastic and damping forces at the end with the lever arms at the start."""
+    """(3,) N m, torque of the elastic and damping forces at the end of the step, with the lever arms at its start."""
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ class _Elements:
     lam: float
     """Pa, Lame parameter."""
     damping_time: float
-    """s."""
+    """Rayleigh coefficient beta, s."""
 
     @classmethod
     def of(cls, t: Trajectory) -> _Elements:
@@ -270,7 +270,7 @@ class _Elements:
             log_j = np.log(np.linalg.det(F1))
         elastic = self.mu * F1 + (self.lam * log_j - self.mu)[:, None, None] * np.swapaxes(inverse, 1, 2)
         force = elastic + F1 @ stress
-        # sum over corners of x0 x -(P g) V, with F0 = sum of x0 outer g.
+        # Torque, the sum of x0 x (-P g) V over the corners; F0 is the sum of x0 outer g over them.
         turning = -np.einsum("t,tij,tkj->ik", self.volumes, F0, force)
         return _Strain(
             -dt * float(self.volumes @ (stress * rate).sum(axis=(1, 2))),
@@ -289,7 +289,7 @@ class _Elements:
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             log_change = np.log(np.linalg.det(np.eye(3) - relative))
-        curved = log_change + _trace(relative)  # -tr(A A) / 2 of a small step
+        curved = log_change + _trace(relative)  # about -tr(A A) / 2 for a small step
         squares = self.mu * (change * change).sum(axis=(1, 2)) + self.lam * log_change**2
         return 0.5 * squares + (self.lam * log_j - self.mu) * curved
 
@@ -302,13 +302,13 @@ class _Pull:
     effort: float
     loss: float
     torque: np.ndarray
-    """(3,) N m, torque of the forces at the end with the lever arms at the start."""
+    """(3,) N m, torque of the muscle forces at the end of the step, with the lever arms at its start."""
 
 
 @dataclass(frozen=True)
 class _Muscles:
-    """Muscle segments with a constant tension along the line between their ends. The tension decreases below 0.7 of the
-    rest length and vanishes below 0.3 (docs/concepts/muscles.md)."""
+    """Muscle segments, which pull along the line between their ends. In a step, the tension of a segment is constant
+    above 0.7 of its rest length, decreases below that, and vanishes below 0.3 (docs/concepts/muscles.md)."""
 
     starts: np.ndarray
     nodes: np.ndarray
@@ -333,22 +333,23 @@ class _Muscles:
         share = 3.0 * limb**2 - 2.0 * limb**3
         work = tension * (self._pulled(long) - self._pulled(short))
         directions = end / np.maximum(short, 1e-300)[:, None]
-        # Implicit Euler applies the force at the end, share T u1, throughout the step. The loss is T (W0 - W1 + share
-        # u1.(x1 - x0)), where W is the length over which the full tension does the same work. It has two parts: the
-        # rotation of the line, and the change of ``share`` of a line shorter than 0.7 of its rest length.
+        # Implicit Euler applies the force at the end of the step, share T u1, throughout the step. The loss is T (W0 -
+        # W1 + share u1.(x1 - x0)), where W is the length over which the full tension does the same work. The loss has
+        # two parts: the rotation of the line, and the change of ``share`` below 0.7 of the rest length.
         turned = 0.5 * share * long * ((start / np.maximum(long, 1e-300)[:, None] - directions) ** 2).sum(axis=1)
         weakened = self._pulled(long) - self._pulled(short) - share * (long - short)
         torque = -np.cross(start, (tension * share)[:, None] * directions).sum(axis=0)
         return _Pull(float(work.sum()), float(work[work > 0.0].sum()), -float(tension @ (turned + weakened)), torque)
 
     def _pulled(self, lengths: np.ndarray) -> np.ndarray:
-        """Return (M,) m, the integral of the fraction of the tension from length 0 to ``lengths`` (M,)."""
+        """Return (M,) m, the integral of the tension, as a fraction of the full tension, from length 0 to ``lengths``
+        (M,) m."""
         rest = self.rest_lengths
         limb = np.clip((lengths / rest - 0.3) / 0.4, 0.0, 1.0)
         return rest * (0.4 * limb**3 - 0.2 * limb**4) + np.maximum(lengths - 0.7 * rest, 0.0)
 
     def _lines(self, positions: np.ndarray) -> np.ndarray:
-        """Return (M, 3) m from the first end of each segment to its second."""
+        """Return (M, 3) m, the vectors from the first to the second end of each segment."""
         if len(self.segments) == 0:
             return np.zeros((0, 3))
         ends = np.add.reduceat(self.weights[:, None] * positions[self.nodes], self.starts[:-1], axis=0)
@@ -370,16 +371,16 @@ def _squared(mass: np.ndarray, velocities: np.ndarray) -> float:
 
 
 def _momentum(mass: np.ndarray, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-    """Return (3,) angular momentum about the centre of mass."""
+    """Return (3,) kg m^2/s, angular momentum about the centre of mass."""
     return mass @ np.cross(positions - mass @ positions / mass.sum(), velocities)
 
 
 def _inertia(mass: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Return (3, 3) inertia about the centre of mass."""
+    """Return (3, 3) kg m^2, inertia about the centre of mass."""
     arms = positions - mass @ positions / mass.sum()
     return float(mass @ (arms**2).sum(axis=1)) * np.eye(3) - np.einsum("n,ni,nj->ij", mass, arms, arms)
 
 
 def _spin(mass: np.ndarray, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-    """Return (3,) rad/s, angular velocity of the rigid rotation with the angular momentum."""
+    """Return (3,) rad/s, angular velocity of the rigid rotation with the angular momentum of ``velocities``."""
     return np.linalg.solve(_inertia(mass, positions), _momentum(mass, positions, velocities))

@@ -29,11 +29,11 @@ class PredictedStep:
     normal_bias: np.ndarray
     """(n,) m/s, velocity bias of each contact in the normal direction, see ``CoupledSolver.normal_bias``."""
     activations: np.ndarray
-    """(M,) m."""
+    """(M,) m, muscle activations."""
     velocities: np.ndarray
-    """(N, 3) m/s, end of the step."""
+    """(N, 3) m/s, at the end of the step."""
     forces: np.ndarray
-    """(n, 3) N, in the axes of each contact."""
+    """(n, 3) N, contact forces in the axes of each contact."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class StepInputs:
     activations: np.ndarray
     """(M,) m, activations of the previous step."""
     forces: np.ndarray
-    """(n, 3) N, contact forces of the previous step; zero for contacts that it did not have."""
+    """(n, 3) N, contact forces of the previous step; zero for contacts that are new in this step."""
 
     @classmethod
     def from_prediction(cls, predicted: PredictedStep, friction: float, activations: np.ndarray) -> StepInputs:
-        """Return the inputs of the same step about ``predicted``, with its contact forces and other previous
-        ``activations``."""
+        """Return the inputs of the step of ``predicted``, with its contact forces, and ``activations`` (M,) m as the
+        activations of the previous step."""
         response = predicted.linearization
         return cls(
             response.tangent.problem, response.contacts, predicted.normal_bias, friction, activations, predicted.forces
@@ -62,8 +62,8 @@ class StepInputs:
 
 @dataclass(frozen=True)
 class LinearStep:
-    """End velocity v(x) and change of angular momentum of a step, affine in x = (activations, contact forces), k
-    unknowns."""
+    """End velocity v(x) and change of angular momentum of a step, as affine functions of the k unknowns x =
+    (activations, contact forces)."""
 
     velocities: Any
     """(3N, k + 1) m/s: derivative of the end velocity with respect to x, and in the last column v(0), without muscles
@@ -153,6 +153,6 @@ class HostStepLinearizer:
 
 def torques_of(problem: StepProblem, contacts: ContactSet, m: int) -> np.ndarray:
     """Return (3, m + 3n) kg m^2/s, derivative of the angular momentum with respect to x: zero for the ``m``
-    activations, and the angular impulse of a body weight along each axis of each contact."""
+    activations, and the angular impulse of one body weight along each axis of each contact."""
     torques = problem.dt * problem.body.weight * contacts.contact_velocities(problem.rotation_modes).T
     return np.hstack([np.zeros((3, m)), torques])

@@ -1,9 +1,9 @@
 """Objectives of a motion: weighted squares of linear functions of the end of a step (docs/concepts/motions.md).
 
-``Objective`` is linear in the end velocity, with the matrix ``rows``. The other kinds are linear in the k unknowns x of
-the QP; ``slopes`` (j, k) is their derivative, computed from ``torques`` (3, k), the derivative of the angular momentum.
-``residual`` (j,) is the value at a given end of the step. Slopes and residuals are in units of ``speed``, sqrt(g H) in
-m/s.
+The residual of an ``Objective`` is linear in the end velocity, with the matrix ``rows``. The residuals of the other
+kinds are linear in the k unknowns x of the QP; ``slopes`` (j, k) is their derivative, computed from ``torques`` (3, k),
+the derivative of the angular momentum. ``residual`` (j,) is the value at a given end of the step. Slopes and residuals
+are in units of ``speed``, sqrt(g H) in m/s.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class Objective:
 
     name: str
     rows: sparse.csr_matrix | np.ndarray
-    """(k, 3N), sparse or dense."""
+    """(k, 3N) matrix, sparse or dense."""
     target: np.ndarray
-    """(k,) m/s."""
+    """(k,) m/s, target of rows v."""
     weight: float
 
     def residual(
@@ -58,12 +58,12 @@ class AngularMomentumObjective:
     """
 
     target: np.ndarray
-    """(3,) kg m^2/s."""
+    """(3,) kg m^2/s, target angular momentum."""
     weight: float
 
     def slopes(self, problem: StepProblem, contacts: ContactSet, torques: np.ndarray, speed: float) -> np.ndarray:
         """Return (3, k), the derivative of the residual with respect to the unknowns; ``torques`` (3, k) kg m^2/s is
-        that of the angular momentum."""
+        the derivative of the angular momentum."""
         return torques / self._unit(problem, speed)
 
     def residual(
@@ -86,9 +86,9 @@ class AngularMomentumObjective:
 
 @dataclass(frozen=True)
 class LoadObjective:
-    """Objective weight times the squared load, as a fraction of the body weight, of each contact of the ``nodes``.
+    """Objective weight times the squared load, as a fraction of the body weight, of each contact at the ``nodes``.
 
-    A loaded contact stays closed whatever velocity its nodes should have, so a foot must be unloaded before it is
+    A loaded contact stays closed, whatever the target velocity of its nodes is. So a foot must be unloaded before it is
     lifted.
     """
 
@@ -112,7 +112,7 @@ class LoadObjective:
         angular_impulse: np.ndarray,
         speed: float,
     ) -> np.ndarray:
-        """Return zeros: loads count in the QP only, not in the objective value of a solved step."""
+        """Return zeros, because loads enter the QP only, not the objective value of a solved step."""
         return np.zeros(len(self._loaded(contacts)))
 
     def _loaded(self, contacts: ContactSet) -> np.ndarray:
@@ -123,22 +123,22 @@ AnyObjective = Objective | AngularMomentumObjective | LoadObjective
 
 
 def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
-    """Return the objective that drives the velocities of all nodes to ``target`` (N, 3) m/s, each weighted by its mass
-    fraction: motion towards a pose."""
+    """Return the objective that drives the velocities of all nodes to ``target`` (N, 3) m/s, for a motion towards a
+    pose. Each node is weighted by its fraction of the mass."""
     shares = body.mass_roots
     return Objective("pose", sparse.csr_matrix(sparse.diags(shares)), shares * target.ravel(), weight)
 
 
 def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarray, weight: float) -> Objective:
-    """Return the objective that makes the body stretch and shear at the rates of the ``target`` velocities, which lead
-    to a pose. Finer deformations are left to elasticity, and translation and rotation to their own objectives.
+    """Return the objective that drives the mean stretch and shear rates of the body to the rates of the ``target``
+    velocities. It leaves finer deformations to elasticity, and translation and rotation to other objectives.
 
-    The six rows are orthonormal in the mass-weighted mean, so the weight is comparable with that of
+    The six rows are orthonormal in the mass-weighted mean, so the weight is comparable with the weight of
     ``node_velocities``.
 
     Args:
         positions: (N, 3) m, at the start of the step.
-        target: (N, 3) m/s, nodal velocities.
+        target: (N, 3) m/s, nodal velocities that lead to a pose.
         weight: weight.
     """
     arms = positions - body.centre_of_mass(positions)
@@ -148,7 +148,7 @@ def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.nda
         modes[mode, :, k] += arms[:, i]
         modes[mode, :, i] += arms[:, k]
     weights = body.mass_roots
-    # Transposed, because LAPACK takes columns.
+    # Transposed, because the QR factorisation orthonormalises columns.
     orthonormal, triangle = np.linalg.qr((modes.reshape(12, -1) * weights).T)
     independent = 6 + np.flatnonzero(np.abs(np.diag(triangle)[6:]) > 1e-6 * np.abs(triangle).max())
     rows = (orthonormal[:, independent] * weights[:, None]).T
@@ -201,7 +201,7 @@ class Coordinates:
     """Coordinates of the target of an objective."""
 
     axes: np.ndarray
-    """(3, 3), whose rows are the unit vectors along which the components of a target are measured."""
+    """(3, 3), rows are the unit vectors along which the components of a target are measured."""
     relative: bool
     """True if the origin moves with the centre of mass of the whole body."""
 
@@ -268,7 +268,7 @@ def part_angular_momentum(
     relative to it.
 
     Rows are in m/s: angular momentum divided by mass x radius of gyration. For the whole body
-    ``AngularMomentumObjective`` is exact; this one uses the lever arms at the start of the step.
+    ``AngularMomentumObjective`` is exact, while this objective uses the lever arms at the start of the step.
     """
     if coordinates.relative:
         pivot, moving = body.centre_of_mass(state.positions), body.node_mass / body.mass
@@ -292,8 +292,9 @@ def part_angular_velocity(
     weight: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Return the objective that drives the angular velocity of ``part``, that of a rigid body with its angular
-    momentum, to ``target`` (3,) rad/s. Rows are in m/s: angular velocity times radius of gyration."""
+    """Return the objective that drives the angular velocity of ``part`` to ``target`` (3,) rad/s. It is the angular
+    velocity of a rigid body with the angular momentum of the part. Rows are in m/s: angular velocity times radius of
+    gyration."""
     momentum = part_angular_momentum(body, part, state, np.zeros(3), weight)
     unit = _gyration(part, state.positions) * part.masses.sum()
     radius = _gyration(part, state.positions)
@@ -326,7 +327,7 @@ def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, w
 
 def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float) -> Objective:
     """Return the objective that drives the velocities of the nodes of ``part`` to ``target`` (k, 3) m/s, with equal
-    weights: position and shape at once."""
+    weights. It controls position and shape of the part together."""
     count = len(part.nodes)
     columns = (3 * part.nodes[:, None] + np.arange(3)).ravel()
     share = np.sqrt(1.0 / count)
@@ -346,10 +347,11 @@ def no_slip_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> 
 
 
 def _along(shares: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return (k, 3N), rows of the mean velocity with weights ``shares`` (N,), along ``axes`` (k, 3)."""
+    """Return (k, 3N), rows that map nodal velocities to their mean with weights ``shares`` (N,), along ``axes`` (k,
+    3)."""
     return (axes[:, None, :] * shares[:, None]).reshape(len(axes), -1)
 
 
 def _gyration(part: BodyPart, points: np.ndarray) -> float:
-    """Return the radius of gyration, m."""
+    """Return the radius of gyration, m, of ``part`` with nodes at ``points`` (N, 3) m."""
     return float(np.sqrt(0.5 * np.trace(part.inertia(points)) / part.masses.sum()))

@@ -19,9 +19,9 @@ from egs_warp.launching import thread_local_cache
 SCALING_PASSES = 4
 """Number of equilibration passes."""
 RHO_UPDATE_INTERVAL = 50
-"""Number of iterations after which rho may change. OSQP's time-based interval would make runs irreproducible."""
+"""Number of iterations after which rho may change. OSQP's default, an interval in time, would not be reproducible."""
 WARM_START_ITERATIONS = 15
-"""Number of iterations of a warm start, which finds the active rows of an optimum."""
+"""Number of iterations of a warm start, which estimates the active rows of an optimum."""
 RHO = 1.0
 """Step size parameter of a warm start, for whitened rows of length 1."""
 _WARM_START_ACCURACY = 1e-3
@@ -52,9 +52,9 @@ class SplittingResult:
 
     status: QpStatus
     x: np.ndarray
-    """(n,)."""
+    """(n,) last point."""
     multipliers: np.ndarray
-    """(m,) positive at an active upper bound."""
+    """(m,) multipliers, positive at an active upper bound."""
 
 
 class OsqpSplitting:
@@ -70,9 +70,9 @@ class OsqpSplitting:
 
         Args:
             units: (m, n) R, rows of length 1.
-            lower: (m,).
-            upper: (m,).
-            start: (n,); None starts from 0.
+            lower: (m,) lower bounds.
+            upper: (m,) upper bounds.
+            start: (n,) initial z; None starts from 0.
         """
         return _osqp_warm_start(-(-len(units) // _ROW_MULTIPLE) * _ROW_MULTIPLE, units.shape[1]).run(
             units, lower, upper, start
@@ -83,7 +83,7 @@ class OsqpSplitting:
         return sparse.csc_matrix(np.triu(self._P))
 
     def full_run(self, A: np.ndarray, iterations: int) -> OsqpIterations:
-        """Set up OSQP with rows ``A`` (m, n), at most ``iterations`` in each run."""
+        """Set up OSQP for constraint rows ``A`` (m, n), with at most ``iterations`` iterations in each run."""
         options: dict[str, Any] = {
             "P": self._upper_half,
             "q": self._q,
@@ -94,7 +94,7 @@ class OsqpSplitting:
 
 
 class OsqpIterations:
-    """Iterations on one QP, set up once.
+    """OSQP iterations on one QP with variable bounds, set up once.
 
     Args:
         options: arguments of ``osqp.OSQP.setup``, except for the bounds and the options that all QPs share.
@@ -128,7 +128,7 @@ class OsqpIterations:
 
 
 def _convert_result(result: Any) -> SplittingResult:
-    """Convert a result of OSQP."""
+    """Convert a result of OSQP to a ``SplittingResult``."""
     status = {
         _CODES.OSQP_SOLVED: QpStatus.SOLVED,
         _CODES.OSQP_SOLVED_INACCURATE: QpStatus.INEXACT,

@@ -26,7 +26,7 @@ from egs_warp.locomotion.solvers import QpSolver
 _STATIC_FRACTION = 0.999
 """Fraction of the friction cone's radius up to which a predicted contact is static."""
 _MIN_GAIN = 1e-9
-"""Smallest decrease of the objective for which a pivot is kept."""
+"""Minimum decrease of the objective for which a pivot is accepted."""
 _ZERO_SPEED = 1e-4
 """Tangential speed in sqrt(g H) up to which a sliding contact may stick."""
 
@@ -40,10 +40,10 @@ def search_states(
     solver: QpSolver | str,
 ) -> ModeSearchResult:
     """Solve the QP in the predicted contact states, then change the state of one contact at a time while the objective
-    falls, in the order of the multipliers of its constraints (Eq. 13; pivoting after Tan, Turk and Liu 2012).
+    decreases, in descending order of the constraints' multipliers (Eq. 13; pivoting after Tan, Turk and Liu 2012).
 
-    If the QP in the predicted states has no solution, the constraints that the predicted activations violate may stay
-    violated by as much.
+    If the QP in the predicted states has no solution, it is solved again with relaxed constraints: a constraint that
+    the predicted activations violate may be violated by the same amount.
 
     Args:
         program: the QP of the step.
@@ -82,8 +82,10 @@ def search_states(
 
 
 def predicted_modes(predicted: PredictedContact, friction: float, directions: int) -> ContactModes:
-    """Return the predicted states as modes (Eq. 12): static where friction is inside the cone, and otherwise sliding,
-    with friction along the direction D_k that opposes the predicted slip most.
+    """Return the predicted states as modes (Eq. 12).
+
+    A contact without load is free. A loaded contact sticks if its force is inside the friction cone. Otherwise it
+    slides, with friction along the direction D_k that opposes the predicted slip most.
 
     Args:
         predicted: predicted contact.
@@ -100,7 +102,8 @@ def predicted_modes(predicted: PredictedContact, friction: float, directions: in
 def _pivots(
     program: CoulombProgram, modes: ContactModes, optimum: ModeRegionOptimum, directions: int
 ) -> list[ContactModes]:
-    """Return the modes after each single change of state that the multipliers of ``optimum`` propose, best first."""
+    """Return the modes after each single change of state that an active constraint of ``optimum`` suggests, in
+    descending order of the multipliers."""
     table, trials = tangent_directions(directions), []
     forces = optimum.x[program.activation_count :].reshape(-1, 3)[:, 1:]
     slips = (program.rows @ optimum.x + program.offset).reshape(-1, 3)[:, 1:]

@@ -1,5 +1,5 @@
-"""The plan of a step: assemble the QP about the predicted end, search it, and compute the end that it expects
-(Eq. 13)."""
+"""The plan of a step: assemble the QP about the predicted end, search for the best contact modes, and compute the
+expected end of the step (Eq. 13)."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ class Plan:
     """Planned activations and the end of the step that the QP expects."""
 
     activations: np.ndarray
-    """(M,) metres."""
+    """(M,) m, planned activations."""
     velocities: np.ndarray
-    """(N, 3) m/s."""
+    """(N, 3) m/s, expected velocities at the end of the step."""
     forces: np.ndarray
-    """(n, 3) newtons."""
+    """(n, 3) N, expected contact forces."""
     qp_count: int = 0
     """Number of QPs that were solved."""
     qp_infeasible: int = 0
@@ -75,7 +75,7 @@ class Plan:
 
 @dataclass
 class StepPlanner:
-    """Planner of the steps of one body: builds the QP and searches it."""
+    """Planner of the steps of one body, which builds the QP and runs the search over contact modes."""
 
     body: SoftBody
     muscles: MuscleSet
@@ -92,10 +92,10 @@ class StepPlanner:
     ) -> Plan:
         """Plan the activations of a step.
 
-        The QP is built about ``predicted`` and searched by the strategy of the settings. Of its solution only the
-        activations are used: the contact forces that follow from them by Coulomb's law, and the end of the step, are
-        computed from the linear step. If that end would invert an element, the predicted velocities are used instead.
-        If no QP has a solution, the plan keeps the previous activations.
+        The QP is built about ``predicted`` and solved by the strategy of the settings. Only the activations of the
+        solution are used. The contact forces are computed again from Coulomb's law for these activations, and the
+        expected end from the linear step. If this end inverts an element, the predicted velocities are used instead. If
+        no QP has a solution, the plan contains the previous activations.
 
         Args:
             predicted: predicted end of the step.
@@ -135,8 +135,8 @@ class StepPlanner:
         response, predicted_velocities, body = predicted.linearization, predicted.velocities, self.body
         problem, contacts = response.tangent.problem, response.contacts
         weight, speed = body.weight, body.speed_unit
-        # ``linearize`` may run both concurrently: only ``EffortModel`` uses the elasticity kernels, which are not
-        # thread-safe.
+        # ``linearize`` may run concurrently with ``EffortModel.of``. Only the latter uses the elasticity kernels, which
+        # are not thread-safe.
         linear, effort_model = self.linear_steps.linearize(
             predicted, lambda: EffortModel.of(problem, predicted_velocities, self.factors)
         )
@@ -169,7 +169,7 @@ class StepPlanner:
 
         Args:
             problem: the step.
-            predicted_velocities: (N, 3) m/s, end up to which the work is computed.
+            predicted_velocities: (N, 3) m/s, predicted end velocities, from which the muscles' work is computed.
             previous: (m,) activations of the previous step.
             count: number of unknowns, of which the first m are the activations.
         """
@@ -183,7 +183,8 @@ class StepPlanner:
         return QuadraticCost(np.diag(diagonal), q, float(change @ previous**2))
 
     def activation_weights(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return (m,) weights of squared activations and (m,) of their squared changes, in a step of ``dt`` s."""
+        """Return the weights (m,) of the squared activations and the weights (m,) of their squared changes, for a step
+        of ``dt`` seconds."""
         step_fraction = dt * MIN_STEPS_PER_TIME_UNIT / self.body.time_unit
         strengths, squares = self._strengths
         settings = self.settings
@@ -194,7 +195,7 @@ class StepPlanner:
 
     @cached_property
     def _strengths(self) -> tuple[np.ndarray, np.ndarray]:
-        """Sums over the muscles of each synergy, (m,) of the relative strength and (m,) of its square."""
+        """Relative strengths (m,) and squared relative strengths (m,), summed over the muscles of each synergy."""
         strength = self.muscles.max_forces / (_REFERENCE_STRENGTH * self.body.weight)
         members = self.synergies.members
         return members.T @ strength, members.T @ strength**2
@@ -205,7 +206,7 @@ class StageClock:
     """Timer of the stages of a step."""
 
     milliseconds: dict[str, float] = field(default_factory=dict)
-    """ms of each stage; a stage that occurs twice is summed."""
+    """Time of each stage, ms; the times of repeated stages are summed."""
     _last: float = field(default_factory=time.perf_counter)
 
     def lap(self, name: str) -> None:

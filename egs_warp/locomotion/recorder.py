@@ -47,8 +47,8 @@ class Recorder:
             muscles: its muscles.
             geometry: ground and contact points.
             start: first state.
-            start_gap: m, smallest gap at ``start``.
-            drag: 1/s, alpha of Rayleigh damping.
+            start_gap: minimum gap at ``start``, m.
+            drag: alpha of the Rayleigh damping, 1/s.
             frame: placement of the body in its capture.
             front: (3,) unit vector in which the body faces; None is its x axis.
             folder: function that returns the folder of the parts, called after the first step; a missing folder is
@@ -90,7 +90,7 @@ class Recorder:
         return Trajectory.load(self._path)
 
     def _write(self) -> None:
-        """Write the full parts, and the first one once the folder is known."""
+        """Write the complete parts to the folder; the first call creates the folder and writes the first part."""
         if self._folder is None:
             return
         if self._path is None:
@@ -112,7 +112,7 @@ class Recorder:
         frame: BodyFrame | None,
         front: np.ndarray | None,
     ) -> dict[str, np.ndarray]:
-        """Return the arrays of the first part: the start, and all that is constant in a run."""
+        """Return the arrays of the first part: the first state, and all constant data of the run."""
         material = body.assembly.material
         part = {
             "time": np.array([start.time]),

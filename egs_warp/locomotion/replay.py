@@ -1,8 +1,8 @@
-"""Continuation of a run that was cut off: recorded steps are replayed without solving, then the solver continues.
+"""Continuation of an interrupted run: recorded steps are replayed without solving, then the solver continues.
 
-All that a step passes to the next one is the state, the ``WarmStart`` and the history of the motion. The first two are
-recorded; the motion is given the recorded steps again and makes the same requests. So nothing else has to be saved, and
-a continued run is bit-identical to one that was never cut off.
+A step passes only the state, the ``WarmStart`` and the history of the motion to the next step. State and warm start are
+recorded. The history is rebuilt, because the motion receives the recorded steps and requests the same objectives again.
+So nothing else has to be saved, and a continued run is bit-identical to an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from egs_warp.locomotion.trajectory import FIRST_PART, part_paths, read_arrays
 
 
 class Replay:
-    """Recorded steps in the folder of a ``Recorder``, returned one request after the other."""
+    """Reader of the steps in the folder of a ``Recorder``, which returns one requested step after the other."""
 
     def __init__(self, folder: Path, start: Mapping[str, np.ndarray], detector: ContactDetector) -> None:
         """Open a recording.
 
         Args:
             folder: folder of the recorder.
-            start: first part as the continued run would write it.
-            detector: detector of its contacts.
+            start: first part that the continued run would write.
+            detector: detector that rebuilds the contacts.
 
         Raises:
             UserError: the recorded run started differently, or its first part is damaged.
@@ -47,10 +47,11 @@ class Replay:
         self._steps = self._recorded(start["positions"][0])
 
     def step(self, request_digest: int) -> list[StepReport]:
-        """Return the next recorded step, as the steps into which it was divided; empty at the end of the recording.
+        """Return the reports of the next requested step, one for each step into which it was divided; an empty list at
+        the end of the recording.
 
         Args:
-            request_digest: ``digest`` of the objectives of the step.
+            request_digest: ``digest`` of the objectives and prescribed values of the step.
 
         Raises:
             UserError: the recorded step had other objectives, or its part is damaged.
@@ -61,7 +62,7 @@ class Replay:
         return reports
 
     def _recorded(self, positions: np.ndarray) -> Iterator[tuple[int, list[StepReport]]]:
-        """Yield the digest and the reports of each requested step, from the state ``positions`` (N, 3)."""
+        """Yield the digest and the reports of each requested step. The first one starts at ``positions`` (N, 3) m."""
         count = 0
         for path in part_paths(self._folder):
             part = _read(path)
@@ -99,8 +100,7 @@ class Replay:
 
 
 def digest(objectives: Sequence[AnyObjective | np.ndarray]) -> int:
-    """Return a 64-bit hash of the objectives of a step and of the velocities and activations that are prescribed to
-    it."""
+    """Return a 64-bit hash of the objectives of a step, and of its prescribed velocities and activations."""
     hasher = hashlib.blake2b(digest_size=8)
 
     def feed(value: Any) -> None:

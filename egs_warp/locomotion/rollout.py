@@ -24,17 +24,17 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.short_repr import short_repr
 
 FRAME_RATE = 60
-"""Frames of a video, 1/s."""
+"""Frame rate of a video, 1/s."""
 REST_FRAMES = 20
-"""Number of frames after the last motion has finished."""
+"""Number of frames for which a run continues after the motion has finished."""
 
 
 class Motion(Protocol):
     """Source of objectives, computed from the measured state."""
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the step of ``dt`` s that starts at ``state``; ``report`` is that of the previous
-        step."""
+        """Return the objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is the report of the
+        previous step."""
         ...
 
 
@@ -46,15 +46,19 @@ class RolloutResult:
 
     trajectory: Trajectory
     reports: tuple[StepReport, ...]
+    """Report of each solver step."""
     frames: np.ndarray
-    """(n,) index into the times of the trajectory for each frame of the video."""
+    """(n,) int, index of each video frame among the states of the trajectory."""
     stopped: bool = False
-    """True if it ended at a step that could not be solved."""
+    """True if the run ended at a step that could not be solved."""
 
 
 def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]:
-    """Return the size of a solver step, s, and the number of steps in a frame. Steps are at most ``step`` s and at most
-    sqrt(H / g) / 19 (docs/concepts/conventions.md). If ``step`` is longer than a frame, a frame lasts ``step`` s."""
+    """Return the size of a solver step in seconds, and the number of steps in a frame.
+
+    A step lasts at most ``step`` seconds and at most sqrt(H / g) / 19 (docs/concepts/conventions.md). If ``step`` is
+    longer than a frame, the frame is extended to ``step`` seconds.
+    """
     max_step = body.time_unit / MIN_STEPS_PER_TIME_UNIT
     frame = max(1.0 / FRAME_RATE, step or 0.0)
     count = int(np.ceil(frame / min(max_step, step or max_step) - 1e-3))
@@ -88,15 +92,16 @@ def roll_out(
         start: first state.
         motion: source of the objectives.
         frames: maximum number of frames.
-        step: s, maximum size of a solver step, see ``solver_steps``.
+        step: maximum size of a solver step, s, see ``solver_steps``.
         place: placement of the body in its capture.
         front: (3,) unit vector in which the body faces, for the recording; None is its x axis.
-        parts: function that returns the folder in which steps are recorded (``Recorder``).
-        resume: folder of a recording whose steps are not solved again (``Replay``).
+        parts: function that returns the folder in which the steps are recorded (``Recorder``); None records none.
+        resume: folder of a recording whose steps are replayed instead of solved (``Replay``); None replays none.
         finished: function that returns True once the motion has finished.
-        aborted: function that returns True if the run ends before the step for which the motion has just been called.
-        kicks: function of time and step size, s, that returns the velocities (N, 3) m/s which external pushes add to
-            the nodes in that step, or None.
+        aborted: function that is called after the motion has returned the objectives of a step. If it returns True, the
+            run ends before this step.
+        kicks: function of time and step size, s, that returns the velocities (N, 3) m/s that external pushes add to the
+            nodes at the start of the step, or None.
         activations: (steps, M) m, prescribed activations, which replace the planned ones; the run ends with the last
             whole frame that they cover.
         progress: function that receives the index of each finished frame.
@@ -158,7 +163,7 @@ def roll_out(
 
 
 def _try_advance(advance: Callable[[], tuple[BodyState, WarmStart, list[StepReport]]]) -> list[StepReport]:
-    """Return the reports of a step; empty if neither it nor a part of it can be solved."""
+    """Return the reports of a step; an empty list if neither the step nor a part of it can be solved."""
     try:
         _, _, done = advance()
     except (UnsolvableStepError, np.linalg.LinAlgError):

@@ -15,30 +15,34 @@ class LocomotionSettings:
     """Options of ``LocomotionStepper``. Lengths are in body heights H, forces in body weights, speeds in sqrt(g H)."""
 
     activation_distance: float = 0.01
-    """Contact points that the step may bring closer than this to a plane take part in the step."""
+    """Gap at the predicted end of a step below which a point can become a contact of the step."""
     penetration_tolerance: float = 5e-3
     """Depth up to which a contact point is not pushed out."""
     push_out_cap: float = 0.05
-    """Largest speed at which points that are deeper are pushed out."""
+    """Maximum speed at which deeper contact points are pushed out."""
     qp_limit: int = 12
-    """Maximum number of QPs in a search; a restart has its own."""
+    """Maximum number of QPs in a search; the search of a restart may use as many again."""
     qp_solver: QpSolver | str | None = None
     """QP solver; None selects ``osqp``, or ``admm`` if the body is on a GPU."""
     strategy: Strategy | str = Strategy.MODES
+    """Strategy of the search over contact modes."""
     directions: int = 4
-    """n_d, number of edges of the friction pyramid of the strategy ``paper``. ``modes`` uses the exact cone instead."""
+    """n_d, number of edges of the friction pyramid of the strategy ``paper``. The strategy ``modes`` uses the exact
+    cone instead.
+    """
     activation_weight: float = 2e-4
-    """Weight of squared activations for a step of sqrt(H / g) / 19 and a muscle of 4 body weights. It scales with the
-    square of the step size, because shorter steps change velocities by less, and with the force of the muscle."""
+    """Weight of squared activations, for a step of sqrt(H / g) / 19 and a muscle of 4 body weights. The weight is
+    scaled with the square of the step size, because shorter steps change velocities less, and with the muscle's force.
+    """
     activation_change_weight: float = 3e-3
-    """Weight of squared changes of activation; scales with the step size and with the square of the force. Without it,
-    strong muscles of a stiff body alternate at full range from step to step, beyond the range in which the linearised
-    QP is accurate."""
+    """Weight of squared changes of activation, for the same step and muscle. It is scaled with the step size and with
+    the square of the muscle's force. Without it, strong muscles of a stiff body alternate at full range from step to
+    step, beyond the range in which the linearised QP is accurate."""
     drag: float = 0.0
-    """alpha of Rayleigh damping, 1/s."""
+    """alpha of the Rayleigh damping, 1/s."""
 
     def __post_init__(self) -> None:
-        # Raises for unknown names here instead of in the first step.
+        # Reject unknown names here instead of in the first step.
         if self.qp_solver is not None:
             QpSolver(self.qp_solver)
         Strategy(self.strategy)

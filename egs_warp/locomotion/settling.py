@@ -19,15 +19,17 @@ SHAPE_TOLERANCE = 1e-3
 """Maximum displacement of a node of the resting body from the captured shape, in body heights."""
 
 _MAX_CORRECTIONS = 12
+"""Maximum number of corrections of the unloaded shape."""
 _ANDERSON_DEPTH = 4
 """Number of iterates from which the next one is extrapolated."""
 
 
 def settle(stepper: LocomotionStepper) -> BodyState:
-    """Let the body come to rest on its ground: long contact steps without muscles, each started without velocity.
+    """Let the body come to rest on its ground by long contact steps without muscles, each of which starts with zero
+    velocity.
 
-    The fall of a body that collapses is not computed to its end: the loop ends once a node moves by 0.2 H in one step,
-    or the centre of mass has moved by a total of 0.1 H.
+    If the body collapses, its fall is not computed to the end: the loop ends once a node moves by more than 0.2 H in
+    one step, or the centre of mass has moved by more than 0.1 H in total.
     """
     body = stepper.body
     state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
@@ -63,14 +65,14 @@ def has_settled(body: SoftBody, max_displacement: Any, centre_displacement: Any)
 def settle_as_captured(stepper: LocomotionStepper, state: BodyState) -> tuple[LocomotionStepper, BodyState, float]:
     """Find the unloaded shape that takes the captured shape at rest on the ground, so that the body does not sag.
 
-    A fixed-point iteration (Sellier, "An iterative method for the inverse elasto-static problem", Journal of Fluids and
-    Structures 27, 2011): the unloaded shape X becomes X - R^T u, where u are the displacements of the resting nodes
-    from the captured shape and R is the best-fit rotation. Masses, material and muscles stay the same; muscles have
-    their rest lengths in the captured shape. A rigid displacement, such as that of a body that rocks onto its third
-    foot, is not an error of the shape, but the iteration continues as long as it decreases.
+    The method is a fixed-point iteration (Sellier, "An iterative method for the inverse elasto-static problem", Journal
+    of Fluids and Structures 27, 2011): the unloaded shape X becomes X - R^T u, where u are the displacements of the
+    resting nodes from the captured shape and R is the best-fit rotation. Masses, material and muscles stay the same;
+    muscles have their rest lengths in the captured shape. A rigid displacement, as when a body rocks onto its third
+    foot, is not an error of the shape, but the iteration continues as long as the total displacement decreases.
 
     Args:
-        stepper: stepper of the body, for which the unloaded shape is the captured one.
+        stepper: stepper of the body, whose unloaded shape is still the captured shape.
         state: its state at rest (``settle``).
 
     Returns:

@@ -16,7 +16,7 @@ from egs_warp.locomotion.active_set import WhitenedQp, solve_from_guess
 from egs_warp.locomotion.operator_splitting import OsqpIterations, OsqpSplitting, QpStatus
 
 MAX_VIOLATION = 3e-3
-"""Largest violation of its bounds up to which a point at the iteration limit is used."""
+"""Maximum violation of the bounds with which a point at the iteration limit is still used."""
 _MAX_ITERATIONS = 4000
 _BOUND_PADDING = 0.3
 """Distance by which bounds are widened, in units of the accuracy."""
@@ -30,7 +30,7 @@ class QpSolver(Enum):
     OSQP = "osqp"
     """A few OSQP iterations on the host, then the active-set method."""
     ADMM = "admm"
-    """The whole mode search as one kernel on the device, with the same iterations and active-set method."""
+    """The whole mode search in one kernel on the device, with the same splitting iterations and active-set method."""
     DAQP = "daqp"
     """DAQP, a dual active-set method on the host; an optional package."""
 
@@ -47,14 +47,15 @@ class QpSolver(Enum):
 
 @dataclass(frozen=True)
 class QpSolution:
-    """Solution of a QP. ``x`` and ``multipliers`` have a meaning only if ``usable``."""
+    """Solution of a QP. ``x`` and ``multipliers`` are meaningful only if ``usable``."""
 
     status: QpStatus
     x: np.ndarray
     """(n,) the minimiser, or the last iterate of a solve that stopped early."""
     multipliers: np.ndarray
-    """(m,) positive at an active upper bound (OSQP's sign)."""
+    """(m,) multipliers, positive at an active upper bound (OSQP's sign)."""
     objective: float
+    """Objective at ``x``; infinite if not ``usable``."""
 
     @property
     def usable(self) -> bool:
@@ -71,8 +72,8 @@ class QuadraticProgram(Protocol):
         """Solve with these bounds.
 
         Args:
-            lower: (m,).
-            upper: (m,).
+            lower: (m,) lower bounds.
+            upper: (m,) upper bounds.
             start: (n,) warm start; None uses the last solution.
             skip_splitting: True if another QP of the same step has been solved; ``SplittingProgram`` then skips
                 operator splitting.
@@ -91,10 +92,10 @@ def quadratic_program(
     """Set up the QP for ``solver`` (or its name), ``osqp`` or ``daqp``.
 
     Args:
-        P: (n, n).
-        q: (n,).
-        A: (m, n).
-        solver: solver.
+        P: (n, n) Hessian.
+        q: (n,) linear term.
+        A: (m, n) constraint rows.
+        solver: the solver.
         accuracy: accuracy of operator splitting, absolute and relative.
     """
     if QpSolver(solver) is QpSolver.DAQP:
@@ -114,7 +115,8 @@ class SplittingProgram:
     def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, *, accuracy: float = 3e-5) -> None:
         self._P, self._q, self._A = P, q, A
         self._splitting = OsqpSplitting(P, q, accuracy=accuracy)
-        # A region that is a single point has unbounded multipliers, so bounds are widened, within the accuracy.
+        # If the feasible set is a single point, multipliers are unbounded. So the bounds are widened by a distance
+        # below the accuracy.
         self._padding = _BOUND_PADDING * accuracy
         self._rows = WhitenedQp.of(P, q, A)
         self._full_run: OsqpIterations | None = None
@@ -126,7 +128,7 @@ class SplittingProgram:
         """Solve with bounds ``lower``, ``upper`` (m,), see ``QuadraticProgram.solve``."""
         start = self._start if start is None else start
         if (upper - lower < _EQUALITY_WIDTH).any():
-            # The equality rows of contact states may be redundant, so they are satisfied to an accuracy, not exactly.
+            # The equality rows of contact states may be redundant, so they are satisfied approximately, not exactly.
             return self._solve_by_splitting(lower, upper, start)
         rows = self._rows
         lower, upper = lower - self._padding, upper + self._padding
@@ -173,12 +175,12 @@ class SplittingProgram:
         return self._solved(solution.x, solution.multipliers)
 
     def _solved(self, x: np.ndarray, multipliers: np.ndarray) -> QpSolution:
-        """Return a solved solution, and store ``x`` for the next warm start."""
+        """Return ``x`` as the solution, with the status ``SOLVED``, and store it for the next warm start."""
         self._start = x
         return _solution(QpStatus.SOLVED, self._P, self._q, x, multipliers, len(multipliers))
 
     def _solve_by_splitting(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
-        """Solve by operator splitting with all rows, to its own accuracy. Set up at the first call."""
+        """Solve by operator splitting with all rows, to its own accuracy. The first call sets up OSQP."""
         if self._full_run is None:
             self._full_run = self._splitting.full_run(self._A, _MAX_ITERATIONS)
         result = self._full_run.run(lower, upper, start)
@@ -238,7 +240,7 @@ class DaqpProgram:
 
 
 def _solution(status: QpStatus, P: np.ndarray, q: np.ndarray, x: Any, multipliers: Any, rows: int) -> QpSolution:
-    """Return the solution of this ``status``, with x = 0 and an infinite objective where it is not usable."""
+    """Return a solution with this ``status``; if it is not usable, with x = 0 and an infinite objective."""
     solution = QpSolution(status, x, multipliers, float("inf"))
     if not solution.usable or x is None or not np.isfinite(x).all():
         failed = QpStatus.INFEASIBLE if status is QpStatus.INFEASIBLE else QpStatus.FAILED

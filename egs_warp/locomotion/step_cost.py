@@ -30,9 +30,9 @@ class QuadraticCost:
     """Cost 1/2 x^T P x + q^T x + constant."""
 
     P: np.ndarray
-    """(k, k)."""
+    """(k, k) Hessian."""
     q: np.ndarray
-    """(k,)."""
+    """(k,) linear term."""
     constant: float
 
     def __add__(self, other: QuadraticCost) -> QuadraticCost:
@@ -46,8 +46,8 @@ def objectives_cost(
     objectives: Sequence[AnyObjective],
     speed: float,
 ) -> Callable[[], QuadraticCost]:
-    """Start computing the weighted squares of ``objectives``, in units of ``speed``; it may run asynchronously on a
-    device.
+    """Start computing the weighted squares of ``objectives``, in units of ``speed``. The computation may run
+    asynchronously on a device.
 
     Args:
         problem: the step.
@@ -84,10 +84,13 @@ def objectives_value(
     forces: np.ndarray,
     speed: float,
 ) -> float:
-    """Return the weighted squares of ``objectives`` at an end of the step, in the same units. Load objectives are zero
-    here.
+    """Return the sum of the weighted squares of ``objectives`` at the given end of the step, in units of ``speed``.
+    Load objectives contribute nothing.
 
     Args:
+        problem: the step.
+        contacts: contacts of the step.
+        objectives: objectives of the motion.
         velocities: (N, 3) m/s, end of the step.
         forces: (n, 3) N, contact forces.
         speed: unit of speed sqrt(g H), m/s.
@@ -103,8 +106,11 @@ def objectives_value(
 
 @dataclass(frozen=True)
 class EffortModel:
-    """Quadratic model of elastic energy and damping potential about the predicted end of a step, for a motion that
-    continues after the step as one implicit step over the rest of the horizon."""
+    """Quadratic model of elastic energy and damping potential at a time horizon after the start of a step.
+
+    The model is expanded about the predicted end of the step. It assumes that the motion continues after the step as
+    one implicit step over the rest of the horizon.
+    """
 
     positions: np.ndarray
     """(N, 3) m, predicted end of the step."""
@@ -129,12 +135,13 @@ class EffortModel:
         *,
         horizon: float = EFFORT_HORIZON,
     ) -> EffortModel:
-        """Build the model at the end of the step and start its factorisation.
+        """Build the model about the predicted end of the step and start its factorisation.
 
         Args:
+            problem: the step.
             predicted_velocities: (N, 3) m/s, predicted end velocities.
-            factors: solver that takes the matrix M + h^2 K.
-            horizon: h in units of sqrt(H / g); h is at least one step.
+            factors: solver that factors the matrix M + h^2 K.
+            horizon: time horizon h in units of sqrt(H / g); at least one step is used.
         """
         body = problem.body
         assembly, duration = body.assembly, max(horizon * body.time_unit, problem.dt)
@@ -144,7 +151,7 @@ class EffortModel:
         )
         energy, gradient = assembly.energy_and_gradient(positions, damping)
         entries = factors.entries_from(assembly.enqueue_hessian(positions, damping, projected=True))
-        # Last, because a GPU factors asynchronously while the host continues.
+        # This comes last, because a GPU factors asynchronously while the host continues.
         factors.factor(duration**2 * entries, np.repeat(body.node_mass, 3))
         return cls(positions, duration, energy, gradient.ravel(), entries, factors)
 
@@ -159,15 +166,18 @@ def effort_cost(
 ) -> QuadraticCost:
     """Return ``weight`` / (m g H) times the elastic energy and damping potential at the horizon of ``model``.
 
-    Among all shapes that meet the objectives, the body takes the one with the least strain, and it returns stored
-    energy. Without this term muscles work against each other. After the step the motion continues as one implicit step
-    over the rest of the horizon, in which stiff modes move only until they are relaxed. At constant velocity a released
-    mode would appear to be strained in the opposite direction.
+    Among all shapes that meet the objectives, this cost prefers the shape with the least strain, and it rewards the
+    release of stored energy. Without it, muscles work against each other. The model lets the motion continue after the
+    step as one implicit step over the rest of the horizon, in which stiff modes move only until they are relaxed. If
+    the motion continued at constant velocity instead, a released mode would appear to be strained in the opposite
+    direction.
 
     Args:
+        problem: the step.
         linear: end velocity of the step as a function of the unknowns x.
         predicted_velocities: (3N,) m/s, end velocities about which the energy is expanded.
-        model: energy, gradient and Hessian there.
+        model: energy, gradient and Hessian at the predicted end.
+        weight: cost of an energy of m g H.
     """
     body, factors = problem.body, model.factors
     quadratic, force = factors.quadratic_form(

@@ -1,6 +1,6 @@
 """The stepper: predict the end of a step, plan the activations, solve motion and contact together (Eq. 4, 9, 12, 13).
 
-``LocomotionStepper.step`` is one step, ``LocomotionStepper.advance`` also repeats one that does not converge. The
+``LocomotionStepper.step`` makes one step; ``LocomotionStepper.advance`` also repeats a step that does not converge. The
 stages are in ``contact.selection`` (contact points), ``linear_step`` and ``planner`` (plan) and
 ``contact.coupled_step`` (solve). On a GPU with the strategy ``modes``, ``device_plan`` replaces prediction and plan.
 """
@@ -53,14 +53,14 @@ margin."""
 
 @dataclass(frozen=True)
 class WarmStart:
-    """Data that a step passes to the next one."""
+    """Data that a step passes to the next step, in addition to its state."""
 
     points: np.ndarray
     """(n,) indices of the contact points in use."""
     forces: np.ndarray
-    """(n, 3) N, in the axes of each contact."""
+    """(n, 3) N, contact forces in the axes of each contact."""
     activations: np.ndarray
-    """(M,) m."""
+    """(M,) m, muscle activations."""
 
     @classmethod
     def from_report(cls, report: StepReport) -> WarmStart:
@@ -68,7 +68,7 @@ class WarmStart:
         return cls(report.contacts.points, report.forces, report.activations)
 
     def is_identical(self, other: WarmStart) -> bool:
-        """Return True if the arrays are the same objects as those of ``other``."""
+        """Return True if the arrays are the same objects as the arrays of ``other``."""
         return self.points is other.points and self.forces is other.forces and self.activations is other.activations
 
 
@@ -81,25 +81,26 @@ class StepReport(BatchedRecord):
     state: BodyState
     """State at the end of the step."""
     dt: float
-    """s."""
+    """Step size, s."""
     contacts: ContactSet
     forces: np.ndarray
-    """(n, 3) N, normal and two tangential components in the axes of each contact."""
+    """(n, 3) N, contact forces: normal and two tangential components in the axes of each contact."""
     end_gaps: np.ndarray
-    """(n,) m, at the end of the step."""
+    """(n,) m, gaps of the contacts at the end of the step."""
     min_gap: float
-    """m, smallest gap of all contact points at the end of the step."""
+    """Minimum gap of all points of the body at the end of the step, m."""
     activations: np.ndarray
-    """(M,) m."""
+    """(M,) m, muscle activations."""
     qp_count: int
     """Number of QPs that were solved."""
     qp_infeasible: int
     """Number of QPs without a solution."""
     newton_iterations: int
+    """Number of Newton steps of the solve."""
     converged: bool
+    """True if the solve converged."""
     added_spin: float
-    """rad/s, rotation in the equation of motion that conserves the angular momentum which implicit Euler loses, see
-    ``StepProblem``."""
+    """Magnitude of ``ImplicitStep.momentum_correction``, rad/s."""
     milliseconds: dict[str, float] = field(default_factory=dict)
     """Wall-clock time of each stage, ms."""
 
@@ -163,8 +164,8 @@ class LocomotionStepper:
         self._prefetched: tuple[WarmStart, StepInputs] | None = None
 
     def with_unloaded_shape(self, nodes: np.ndarray) -> LocomotionStepper:
-        """Return a stepper of the same body with the unloaded positions ``nodes`` (N, 3) m. It shares the factors and
-        buffers of this one; therefore use both in one thread only."""
+        """Return a stepper of the same body with the unloaded positions ``nodes`` (N, 3) m. Both steppers share factors
+        and buffers, so they must be used in the same thread."""
         other = object.__new__(type(self))
         vars(other).update(vars(self))
         other.body = replace(self.body, assembly=self.body.assembly.with_rest_shape(nodes))
@@ -172,8 +173,8 @@ class LocomotionStepper:
         return other
 
     def with_friction(self, friction: float) -> LocomotionStepper:
-        """Return a stepper for the same ground with another Coulomb coefficient. It is cheap, because it shares the
-        factors and buffers of this one; therefore use both in one thread only."""
+        """Return a stepper for the same ground with another Coulomb coefficient. Both steppers share factors and
+        buffers, so the call is cheap, and they must be used in the same thread."""
         # ``copy.copy`` would call ``__reduce__`` and build a new stepper.
         other = object.__new__(type(self))
         vars(other).update(vars(self))
@@ -212,9 +213,9 @@ class LocomotionStepper:
     ) -> tuple[BodyState, WarmStart, list[StepReport]]:
         """Make one step of ``dt`` s; if it does not converge, repeat it as half steps.
 
-        The half steps do not replan: the objectives are those of the whole step. The planned activations may be the
-        cause of the failure, so the half steps are computed twice, with the planned and with the previous activations.
-        A result that converged is preferred; otherwise the lower objective value decides.
+        The half steps are not planned, because the objectives apply to the whole step. The planned activations may be
+        the cause of the failure, so the half steps are computed twice, with the planned and with the previous
+        activations. A result that converged is preferred; otherwise the result with the lower objective value is used.
 
         Args:
             state: state at the start.
@@ -238,8 +239,8 @@ class LocomotionStepper:
     def _rank_half_steps(
         self, state: BodyState, reports: Sequence[StepReport], objectives: Sequence[AnyObjective]
     ) -> tuple[bool, float]:
-        """Return the rank of half steps for ``advance``: True if any of ``reports`` did not converge, then the
-        objective value at their end. ``state`` is the start of the first."""
+        """Return the sort key of half steps for ``advance``: True if any of ``reports`` did not converge, and the
+        objective value at their end. ``state`` is the state at their start."""
         before, last = (reports[-2].state if len(reports) > 1 else state), reports[-1]
         problem = StepProblem(self.body, before, last.dt, self.settings.drag)
         value = objectives_value(
@@ -250,8 +251,8 @@ class LocomotionStepper:
     def advance_with_activations(
         self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float
     ) -> tuple[BodyState, WarmStart, list[StepReport]]:
-        """Make one step of ``dt`` s with prescribed ``activations`` (M,) m, as half steps if it does not converge; see
-        ``advance``."""
+        """Make one step of ``dt`` seconds with prescribed ``activations`` (M,) m; if it does not converge, repeat it as
+        half steps. Other arguments and results are described at ``advance``."""
         with one_blas_thread(), self.factors.stream:
             end, after, report = self.step_with_activations(state, memory, activations, dt)
             if report.converged:
@@ -261,8 +262,8 @@ class LocomotionStepper:
     def _half_steps(
         self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float, max_halvings: int
     ) -> tuple[BodyState, WarmStart, list[StepReport]]:
-        """Make two steps of ``dt`` / 2 with ``activations`` (M,) m, each of which is halved again up to
-        ``max_halvings`` - 1 times if it does not converge."""
+        """Make two steps of ``dt`` / 2 seconds with ``activations`` (M,) m. A step that does not converge is halved
+        again, up to ``max_halvings`` - 1 times."""
         reports: list[StepReport] = []
         for _ in range(2):
             end, after, report = self.step_with_activations(state, memory, activations, 0.5 * dt)
@@ -279,7 +280,7 @@ class LocomotionStepper:
         """Make one step of ``dt`` s with prescribed ``activations`` (M,) m: detect, predict, solve, report.
 
         Returns:
-            State at the end, warm start of the next step, and the report, which says whether the step converged.
+            State at the end, warm start of the next step, and the report, whose ``converged`` the caller must check.
         """
         clock = StageClock()
         problem = StepProblem(self.body, state, dt, self.settings.drag)
@@ -313,14 +314,14 @@ class LocomotionStepper:
             dt: step size, s.
 
         Returns:
-            State at the end, warm start of the next step, and the report, which says whether the step converged.
+            State at the end, warm start of the next step, and the report, whose ``converged`` the caller must check.
         """
         clock = StageClock()
         start = self._start(state, memory, dt)
         problem = start.problem
         clock.lap("detect")
         response, plan = self._plan(start, objectives, clock)
-        # Meanwhile a GPU already runs the solve.
+        # A GPU already runs the solve meanwhile.
         expected = self._objective_value(problem, objectives, response.contacts, plan)
         result = self._solve(response, plan)
         clock.lap("solve")
@@ -340,8 +341,8 @@ class LocomotionStepper:
         return end, after, report
 
     def _start(self, state: BodyState, memory: WarmStart, dt: float) -> StepInputs:
-        """Detect the contacts of a step and collect its inputs, or return those that were prefetched after the previous
-        step if the step continues from there."""
+        """Detect the contacts of a step and collect its inputs. If the step continues from the previous step, its
+        prefetched inputs are returned."""
         prefetched, self._prefetched = self._prefetched, None
         if (
             prefetched is not None
@@ -362,8 +363,8 @@ class LocomotionStepper:
     def _plan(
         self, start: StepInputs, objectives: Sequence[AnyObjective], clock: StageClock
     ) -> tuple[ContactLinearization, Plan]:
-        """Predict the end of the step and plan its activations about it. On a GPU the device planner does both at once;
-        where it returns None, or on a CPU, they are done one after the other.
+        """Predict the end of the step and plan its activations about this end. On a GPU the device planner does both at
+        once. On a CPU, or if the device planner returns None, prediction and plan are separate stages.
 
         Returns:
             The contact linearisation at the predicted end, and the plan.
@@ -390,7 +391,7 @@ class LocomotionStepper:
         body beyond the range in which the linearisation about the predicted end is accurate.
 
         Returns:
-            Plan and result with the lower objective value; the plan counts the QPs of both.
+            Plan and result with the lower objective value; the QP counts of the plan include both plans.
         """
         response = result.linearization
         bias = self.solver.normal_bias(result.contacts, problem.dt)
@@ -423,8 +424,8 @@ class LocomotionStepper:
         return objectives_value(problem, contacts, objectives, end.velocities, end.forces, self.body.speed_unit)
 
     def _detect(self, problem: StepProblem, memory: WarmStart) -> ContactSet:
-        """Select the contacts of the step: points in use and points that the ballistic motion brings close to the
-        ground. A prefetched selection of the linearizer is used if there is one."""
+        """Select the contacts of the step: points in use, and points that ballistic motion brings close to the ground.
+        If the linearizer has prefetched a selection, it is used."""
         loaded = memory.forces[:, 0] > 0.0
         contacts = self.linearizer.select_contacts(problem, memory.points, loaded)
         if contacts is not None:
@@ -435,13 +436,14 @@ class LocomotionStepper:
     def predict(self, start: StepInputs) -> PredictedStep:
         """Predict the end of the step under the activations of the previous step, which ``start`` contains (Eq. 12).
 
-        It starts from rigid motion of the whole body. One Newton step with the previous contact forces gives the
-        velocities at which the tangent is factored; the plan uses this tangent. Then ``PREDICTION_ITERATIONS`` Newton
-        steps solve for velocities and Coulomb forces. A step that would invert an element is discarded.
+        The prediction starts from a rigid motion of the whole body. One Newton step with the previous contact forces
+        gives the velocities at which the tangent is factored; the plan uses this tangent. Then
+        ``PREDICTION_ITERATIONS`` Newton steps solve for velocities and Coulomb forces. A Newton step that would invert
+        an element is discarded.
         """
         problem, contacts, previous_forces = start.problem, start.contacts, start.forces
         velocities, tension = problem.rigid_guess, MuscleEnergy.of(self.muscles, start.activations)
-        # Without the stiffness of the muscles, which does not improve the prediction; only the solve uses it.
+        # The tangent omits the stiffness of the muscles, which does not improve the prediction; only the solve uses it.
         tangent = problem.tangent(self.factors, velocities, None)
         newton_velocities = self.linearizer.predict_velocities(tangent, contacts, tension, velocities, previous_forces)
         if newton_velocities is not None:

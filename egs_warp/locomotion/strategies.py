@@ -27,18 +27,21 @@ from egs_warp.locomotion.paper_strategy import search_states
 from egs_warp.locomotion.solvers import QpSolver
 
 RESTART_GAP = 1.2
-"""A mode search restarts from the relaxed optimum if its objective exceeds that optimum's by more than this factor."""
+"""A mode search restarts from the relaxed optimum if its objective exceeds this factor times the relaxed objective."""
 RESTART_COST = 0.3
-"""A mode search restarts only if the end of the step costs at least this."""
+"""Minimum objective for which a mode search restarts."""
 
 
 class Strategy(Enum):
     """Search for the contact modes of a step."""
 
     MODES = "modes"
-    """From the predicted modes, all contacts at once, with the exact friction cone (``search_modes``)."""
+    """Search from the predicted modes, changing all contacts at once, with the exact friction cone (``search_modes``).
+    """
     PAPER = "paper"
-    """The paper's: in the predicted states, then one contact at a time, with a friction pyramid (``search_states``)."""
+    """Search of the paper: from the predicted states, one contact at a time, with a friction pyramid
+    (``search_states``).
+    """
 
     @classmethod
     def _missing_(cls, value: object) -> Strategy:
@@ -56,14 +59,15 @@ def search_program(
     solver: QpSolver | str = QpSolver.OSQP,
     device: Device = None,
 ) -> ModeSearchResult:
-    """Find activations and contact forces of a step by ``strategy`` (or its name).
+    """Find activations and contact forces of a step.
 
     Args:
         program: the QP of the step.
+        strategy: the strategy, or its name.
         predicted: predicted contact, from which the search starts.
         directions: number of edges of the friction pyramid of the strategy ``paper``.
         qp_limit: maximum number of QPs of a search.
-        solver: QP solver; only the strategy ``modes`` supports ``admm``, and the other one uses OSQP instead.
+        solver: QP solver, or its name; the strategy ``paper`` uses ``osqp`` in place of ``admm``.
         device: device of the solver ``admm``.
     """
     solver = QpSolver(solver)
@@ -96,7 +100,7 @@ def _first_search(program: CoulombProgram, predicted: PredictedContact, options:
 def _search_with_restart(
     program: CoulombProgram, result: ModeSearchResult, forces: np.ndarray, options: _SearchOptions
 ) -> ModeSearchResult:
-    """Return ``result``, or the better result of a restart if its objective is high."""
+    """Return ``result``; if its objective is high, restart and return the better of both results."""
     if not needs_restart(result.objective, program.contact_count):
         return result
     return _restart(program, result, forces, options)
@@ -120,8 +124,8 @@ def _search_from(
 def _restart(
     program: CoulombProgram, result: ModeSearchResult, forces: np.ndarray, options: _SearchOptions
 ) -> ModeSearchResult:
-    """Restart from the relaxed optimum, see ``restart_from_relaxation``; the Coulomb solve starts from ``forces`` (n,
-    3)."""
+    """Restart from the relaxed optimum (``restart_from_relaxation``); the Coulomb solve there starts from ``forces``
+    (n, 3)."""
 
     def search(activations: np.ndarray) -> ModeSearchResult:
         start = program.contact_response(activations, forces)
@@ -135,15 +139,16 @@ def restart_from_relaxation(
     relaxed: tuple[np.ndarray, float] | None,
     search: Callable[[np.ndarray], ModeSearchResult],
 ) -> ModeSearchResult:
-    """Search again from the relaxed optimum if ``result`` costs more than ``RESTART_GAP`` times its objective.
+    """Search again from the relaxed optimum if the objective of ``result`` exceeds ``RESTART_GAP`` times the relaxed
+    objective.
 
     Args:
         result: result of the first search.
         relaxed: activations (m,) and objective of the relaxed optimum, see ``solve_relaxed``.
-        search: search from activations (m,) and the contact forces that follow from them.
+        search: function that searches from activations (m,) and the contact forces that they cause.
 
     Returns:
-        The better result, with the number of QPs of both.
+        The better of the two results, with the QP counts of both searches.
     """
     result = replace(result, qp_count=result.qp_count + 1)
     if relaxed is None or result.objective <= RESTART_GAP * relaxed[1]:

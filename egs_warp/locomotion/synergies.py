@@ -15,7 +15,7 @@ from egs_warp.muscles.muscle_set import MuscleSet
 MAX_SYNERGIES = 120
 """Maximum number of synergies."""
 _MIN_SYNERGY_LIMIT, _SYNERGIES_PER_NODE = 80, 0.32
-"""For coarse bodies: maximum number of synergies per node, and the lower limit of that maximum."""
+"""Lower limit of the maximum number of synergies, and maximum number of synergies per node of the cage."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,14 @@ def find_synergies(
 ) -> Synergies:
     """Group muscle segments that accelerate the body in similar directions.
 
-    The clustering uses average linkage, with one minus the cosine between their effects as the distance, in the norm of
-    the kinetic energy.
+    The clustering uses average linkage. The distance between two segments is one minus the cosine between their
+    effects, in the norm of the kinetic energy.
 
     Args:
+        muscles: muscles of the body.
         effects: (3N, M) m/s, nodal velocities that each segment causes at its bound.
-        node_mass: (N,) kg.
-        max_count: maximum number of groups. None selects 0.32 per node, at least 80 and at most 120.
+        node_mass: (N,) kg, lumped masses.
+        max_count: maximum number of groups; None sets it to 0.32 per node, at least 80 and at most 120.
     """
     if max_count is None:
         max_count = int(min(max(_MIN_SYNERGY_LIMIT, _SYNERGIES_PER_NODE * len(node_mass)), MAX_SYNERGIES))

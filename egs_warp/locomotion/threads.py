@@ -1,4 +1,4 @@
-"""Limit on the threads of BLAS: the dense matrices of a step are too small for several."""
+"""Limit on the number of BLAS threads, because the dense matrices of a step are too small for several threads."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from threadpoolctl import ThreadpoolController
 
 @cache
 def _libraries() -> ThreadpoolController:
-    # The BLAS libraries of NumPy and SciPy, both loaded by now. Cached, because finding them takes milliseconds.
+    # The BLAS libraries of NumPy and SciPy, which are both loaded at the first call. Cached, because finding them takes
+    # milliseconds.
     return ThreadpoolController()
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """Return a context manager that limits BLAS to one thread. With more threads a step takes 50 % longer, and ten
-    times as long when other processes use the cores."""
+    """Return a context manager that limits BLAS to one thread. With more threads, a step takes 50 % longer; if other
+    processes use the cores, it takes ten times as long."""
     return _libraries().limit(limits=1, user_api="blas")

@@ -1,4 +1,4 @@
-"""Result of a simulation: every solver step, its contacts and external pushes; and the outcome of a motion."""
+"""Trajectory of a simulation, with all solver steps, contacts and external pushes; and the outcome of a motion."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from egs_warp.short_repr import short_repr
 SCHEMA = 3
 """Version of ``trajectory.npz`` (docs/guide/report.md)."""
 STATES = ("time", "positions", "velocities", "min_gap")
-"""Arrays of F+1 rows."""
+"""Arrays with one row for each of the F+1 states."""
 STEPS = ("dt", "activations")
-"""Arrays of F rows."""
+"""Arrays with one row for each of the F steps."""
 CONTACTS = (
     "contact_step",
     "contact_nodes",
@@ -30,102 +30,107 @@ CONTACTS = (
     "contact_force",
     "contact_gap",
 )
-"""Arrays of C rows."""
+"""Arrays with one row for each of the C contacts."""
 KICKS = ("kick_step", "kick_velocity")
-"""Arrays of one row for each step with external pushes."""
+"""Arrays with one row for each step with external pushes."""
 FIRST_PART = "start.npz"
 """File of the first part of a recording: all constant data, and the first state."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Trajectory of F solver steps of N nodes with C contacts in all. Units: m, s, kg, N. The z axis points up,
-    orthogonal to the ground.
+    """Trajectory of F solver steps of N nodes, with C contacts in total. Units: m, s, kg, N.
 
-    The frame is the body's own. ``body_axes``, ``body_origin`` and ``metres_per_unit`` place it in the capture.
+    The coordinates are in the body's frame, whose z axis points up, orthogonal to the ground. ``body_axes``,
+    ``body_origin`` and ``metres_per_unit`` place this frame in the capture.
     """
 
     __repr__ = short_repr
 
     time: np.ndarray
-    """(F+1,) s."""
+    """(F+1,) s, time of each state."""
     dt: np.ndarray
     """(F,) s, size of each step."""
     positions: np.ndarray
-    """(F+1, N, 3) m."""
+    """(F+1, N, 3) m, nodal positions."""
     velocities: np.ndarray
-    """(F+1, N, 3) m/s."""
+    """(F+1, N, 3) m/s, nodal velocities."""
     rest_positions: np.ndarray
-    """(N, 3) m, as captured; Gaussians and muscles are embedded in this shape."""
+    """(N, 3) m, nodal positions of the captured shape, in which Gaussians and muscles are embedded."""
     unloaded_positions: np.ndarray
-    """(N, 3) m, without elastic stress."""
+    """(N, 3) m, nodal positions without elastic stress."""
     tets: np.ndarray
-    """(T, 4) int32."""
+    """(T, 4) int32, nodes of each tetrahedron."""
     node_mass: np.ndarray
-    """(N,) kg."""
+    """(N,) kg, lumped masses."""
     gravity: np.ndarray
-    """(3,) m/s^2."""
+    """(3,) m/s^2, gravitational acceleration."""
     planes: np.ndarray
-    """(P, 4) rows n, d of n.x + d = 0. The first is the ground; if the ground is not flat, the level from which its
-    heights are measured, in the body's frame."""
+    """(P, 4) rows (n, d) of the planes n.x + d = 0. The first plane is the ground; if the ground is not flat, it is the
+    level from which its heights are measured."""
     solid_from_plane: np.ndarray
     """(P,) int32, solid of each plane. A point is inside a solid if it is below all of its planes; a solid of one plane
     is a half space."""
     friction: float
+    """Coulomb coefficient mu."""
     drag: float
-    """alpha of Rayleigh damping, 1/s."""
+    """alpha of the Rayleigh damping, 1/s."""
     young_modulus: float
-    """Pa."""
+    """Young's modulus E, Pa."""
     poisson_ratio: float
+    """Poisson's ratio nu."""
     damping_time: float
-    """beta of Rayleigh damping, s."""
+    """beta of the Rayleigh damping, s."""
     height: float
-    """H, m."""
+    """Height H of the body, m."""
     contact_step: np.ndarray
-    """(C,) int32: step i goes from time i to time i+1."""
+    """(C,) int32, step of each contact; step i leads from state i to state i+1."""
     contact_nodes: np.ndarray
-    """(C, 4) int32."""
+    """(C, 4) int32, nodes of the tetrahedron of each contact point."""
     contact_weights: np.ndarray
-    """(C, 4)."""
+    """(C, 4) barycentric weights of the contact point."""
     contact_plane: np.ndarray
     """(C,) int32, row of ``planes``; 0 is the ground, flat or not."""
     contact_normal: np.ndarray
-    """(C, 3) unit normal of that plane, or of uneven ground below the contact at the start of the step."""
+    """(C, 3) unit normal of the contact plane, or of uneven ground below the contact at the start of the step."""
     contact_force: np.ndarray
-    """(C, 3) N on the body, world axes."""
+    """(C, 3) N, force on the body in world axes."""
     contact_gap: np.ndarray
-    """(C,) m, distance from the plane of the contact at the end of the step."""
+    """(C,) m, gap of the contact at the end of the step."""
     min_gap: np.ndarray
-    """(F+1,) m, smallest gap of all contact Gaussians."""
+    """(F+1,) m, minimum gap of all contact points of the body."""
     activations: np.ndarray
-    """(F, M) m: the tension of a segment is its stiffness times this, constant over the step."""
+    """(F, M) m, muscle activations, constant over a step; the tension of a segment is its stiffness times its
+    activation."""
     muscle_end_starts: np.ndarray
-    """(K+1,) int32: end k of the muscles is the sum of weight times node position over the entries ``starts[k]`` to
-    ``starts[k + 1]``."""
+    """(K+1,) int32, offset of each muscle end in ``muscle_end_nodes`` and ``muscle_end_weights``. The position of end k
+    is the sum of weight times node position over its entries."""
     muscle_end_nodes: np.ndarray
-    """(E,) int32."""
+    """(E,) int32, node of each entry."""
     muscle_end_weights: np.ndarray
-    """(E,)."""
+    """(E,) weight of each entry."""
     muscle_segments: np.ndarray
     """(M, 2) int32, the two ends of each segment."""
     muscle_rest_lengths: np.ndarray
-    """(M,) m."""
+    """(M,) m, rest length of each segment."""
     muscle_stiffness: np.ndarray
-    """(M,) N/m."""
+    """(M,) N/m, stiffness of each segment."""
     ground_axes: np.ndarray = field(default_factory=lambda: np.eye(3))
     """(3, 3) rows: axes along columns, rows and heights of uneven ground."""
     ground_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     """(3,) m, position of grid node (0, 0) at height 0."""
     ground_spacing: float = 1.0
-    """m between grid nodes."""
+    """Distance between grid nodes, m."""
     ground_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    """(rows, columns) m, coefficients of its biquadratic B-spline (``HeightField``); empty if the ground is flat."""
+    """(rows, columns) m, coefficients of the biquadratic B-spline of the ground (``HeightField``); empty if the ground
+    is flat.
+    """
     kick_step: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
     """(K,) int32, steps with external pushes."""
     kick_velocity: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
-    """(K, N, 3) m/s, velocities that they added to the nodes at the start of the step."""
+    """(K, N, 3) m/s, velocities that the pushes added to the nodes at the start of the step."""
     planned_com: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(F+1, 3) m, planned centre of mass, NaN where there was no plan; may have no rows."""
+    """(F+1, 3) m, planned centre of mass, NaN for states without a plan; no rows if nothing was planned."""
     body_axes: np.ndarray = field(default_factory=lambda: np.eye(3))
     """(3, 3) rows: this frame's x, y and z in the capture's axes."""
     body_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -133,12 +138,12 @@ class Trajectory:
     metres_per_unit: float = 1.0
     """Length of the capture's unit, m."""
     front: np.ndarray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
-    """(3,) unit vector along the ground in which the body at rest faces; x in files without it."""
+    """(3,) unit vector along the ground in which the body at rest faces; the x axis if the file does not contain it."""
     relative_stiffness: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(T,) Young's modulus of each element relative to ``young_modulus``; empty if it is the same everywhere."""
 
     def in_capture(self, points: np.ndarray) -> np.ndarray:
-        """Return ``points`` (..., 3) of this frame in the capture's frame and unit."""
+        """Transform ``points`` (..., 3) m from this frame to the frame and unit of the capture."""
         return BodyFrame(self.body_axes, self.body_origin, self.metres_per_unit).capture_points(points)
 
     def with_plan(self, planned_com: np.ndarray) -> Trajectory:
@@ -151,7 +156,7 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: Path) -> Trajectory:
-        """Read a file of ``save``, or the steps so far in the folder of a ``Recorder``.
+        """Read a file that ``save`` has written, or the steps so far in the folder of a ``Recorder``.
 
         Raises:
             ValueError: the file has another schema.
@@ -194,7 +199,7 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of a file of ``write_arrays``.
+    """Read the arrays of a file that ``write_arrays`` has written.
 
     Raises:
         ValueError: the file has another schema.
@@ -214,13 +219,13 @@ class MotionOutcome:
     distance: float
     """Horizontal displacement of the centre of mass from start to end."""
     height: float
-    """Highest point of the centre of mass minus its height at the start."""
+    """Maximum height of the centre of mass minus its height at the start."""
     heading_degrees: float
     """Rotation about the plane's normal, including full turns."""
     tilt_degrees: float
     """Angle between the normal and the up axis of the body's best-fit rotation, at the end."""
     airborne_frames: float
-    """60 times the longest time in s during which every contact Gaussian is above the plane."""
+    """Longest time during which no contact point touches the ground or a solid, in frames of 1/60 s."""
 
 
 def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> MotionOutcome:
@@ -256,7 +261,7 @@ def _best_fit(t: Trajectory, positions: np.ndarray) -> np.ndarray:
 
 
 def _headings(t: Trajectory, first: int, last: int, up: np.ndarray) -> np.ndarray:
-    """Return (n,) rad about ``up`` since ``first``, unwrapped so that full turns are included."""
+    """Return (n,) rad, rotation about ``up`` since the state ``first``, unwrapped so that full turns are included."""
     start = _best_fit(t, t.positions[first])
     angles = []
     for positions in t.positions[first : last + 1]:

@@ -57,7 +57,7 @@ _INDICES = {
     "muscle_segments": "ends",
     "kick_step": "steps",
 }
-"""Arrays of integers, each below this extent."""
+"""Extent below which all values of each integer array must be."""
 _POSITIVE = ("node_mass", "height", "metres_per_unit", "ground_spacing", "dt", "relative_stiffness")
 _MAY_BE_NAN = ("planned_com", "min_gap")
 """Arrays that may contain NaN: where there is no plan or no contact point."""
@@ -119,7 +119,7 @@ def _extents(t: Trajectory) -> dict[str, int]:
         raise ValueError("its arrays have inconsistent shapes")
     if t.relative_stiffness.shape not in ((0,), (extents["tets"],)):
         raise ValueError(f"relative_stiffness has shape {t.relative_stiffness.shape}")
-    # May be absent if the run has no pushes.
+    # ``kick_velocity`` may be absent if the run has no pushes.
     has_no_pushes = extents["kicks"] == 0 and t.kick_velocity.shape == (0, 0, 3)
     if t.kick_velocity.shape != (extents["kicks"], extents["nodes"], 3) and not has_no_pushes:
         raise ValueError(f"kick_velocity has shape {t.kick_velocity.shape}")

@@ -36,8 +36,8 @@ def contact_record_kernel(
 ):
     """Write nodes, weights, frame, gap and face of the first ``counts`` of the ``points`` (B, K), and zeros as padding.
 
-    The frame is that of the face in ``frames``, or that of uneven ground below the point if there are ``coefficients``
-    and the face is 0.
+    The frame is taken from ``frames``. If the face is 0 and there are ``coefficients``, it is the frame of the uneven
+    ground below the point.
     """
     world, k = wp.tid()
     record_nodes = wp.vec4i()
@@ -74,8 +74,8 @@ def contact_jacobian_kernel(
     # Out:
     rows_out: wp.array3d[real],
 ):
-    """Write the transposed contact Jacobian W^T (c, 3N, 3K) into zeroed memory: the nodal impulses of a unit impulse
-    along each contact axis.
+    """Write the transposed contact Jacobian W^T (c, 3N, 3K) into zeroed memory. Its columns are the nodal impulses of
+    unit impulses along the contact axes.
     """
     world, k = wp.tid()
     if k < counts[world]:
@@ -97,8 +97,8 @@ def contact_velocities_kernel(
     # Out:
     speeds_out: wp.array3d[real],
 ):
-    """Compute the contact velocities W v (c, 3K, m) for nodal velocities v (c, 3N, m). The velocities of padding are
-    set to zero."""
+    """Compute the contact velocities W v (c, 3K, m) for nodal velocities v (c, 3N, m). Padding entries are set to
+    zero."""
     world, k, column = wp.tid()
     speeds = Vec3()
     if k < counts[world]:
@@ -124,7 +124,7 @@ def nodal_force(
     world: int,
     node: int,
 ):
-    """Return the sum of the contact ``forces`` at a node, W^T f, over the contacts in their order."""
+    """Return the nodal force W^T f at ``node``, summed over the contacts in their order."""
     total = Vec3()
     for k in range(counts[world]):
         for corner in range(4):

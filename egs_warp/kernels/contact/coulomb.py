@@ -3,11 +3,11 @@ equations (Eq. 8, 9).
 
 Projecting the forces onto the cone of Coulomb's law gives equations P(f) = f - proj(f - rate u(f)) = 0, whose solutions
 satisfy the law (Alart and Curnier). An attempt sweeps over the contacts, then takes Newton steps on P:
-``projection_residual`` evaluates P, ``find_step`` solves for the step, and the step is halved until the norm of P
-decreases. Later attempts use full steps and other rates. The last attempt polishes the best forces.
+``projection_residual`` evaluates P, and ``find_step`` solves for the step. In the first attempt, the step is halved
+until the norm of P decreases. Later attempts use full steps and other rates. The last attempt polishes the best forces.
 
 A block of threads solves each problem on a GPU, one thread on a CPU; ``lane`` is the index of a thread in its block.
-All lanes take the same branches. Wide work is split over the lanes; short work is repeated by each.
+All lanes take the same branches. Long loops are split over the lanes; short computations are repeated by each lane.
 """
 
 import warp as wp
@@ -33,14 +33,14 @@ wp.set_module_options({"enable_backward": False})
 _FEW_SWEEPS, _MORE_SWEEPS = wp.constant(3), wp.constant(20)
 """Number of sweeps before the first attempt, and before each later one."""
 _ATTEMPTS = wp.constant(7)
+"""Maximum number of attempts before the polishing."""
 _Rates = wp.types.vector(7, real)
 _RATES = wp.constant(_Rates(1.0, 0.3, 3.0, 0.1, 10.0, 0.03, 30.0))
-"""Projection rate of each attempt. Where the kinks of the projection stop the steps of one rate from decreasing the
-residual, full steps of another make progress. Every second attempt changes the rate in each step, which breaks
-cycles.
+"""Projection rate of each attempt. If kinks of the projection prevent steps with one rate from decreasing the residual,
+full steps with another rate make progress. Every second attempt changes the rate in each step, which breaks cycles.
 """
 _FULL_STEPS = wp.constant(12)
-"""Number of full steps in each attempt but the first."""
+"""Number of full steps in each attempt except the first."""
 _HALVINGS = wp.constant(10)
 """Maximum number of halvings of a step in the line search."""
 _MAX_SWEPT = wp.constant(MAX_SWEPT_CONTACTS)
@@ -49,13 +49,13 @@ _MIN_PIVOT = wp.constant(real(1e-5))
 _MIN_DECREASE = wp.constant(real(1e-4))
 """Sufficient decrease of the residual norm, per unit of the step length."""
 _REGULARIZATION, _STRONG_REGULARIZATION = wp.constant(real(1e-6)), wp.constant(real(1e-4))
-"""Regularisation: added to the diagonal of the normal and sticking equations, whose entries are about 1. It selects
-a short step where contacts are redundant, and limits the rounding where they nearly are. The second value is used
-in the first ``_STRONG_STEPS`` steps of all attempts but the first. Without the second value, and with a constant rate
-in each attempt, 16 of 296 difficult problems of jumps stay unsolved instead of 3.
+"""Regularisation, which is added to the diagonal of the normal and sticking equations, whose entries are about 1. It
+selects a short step if contacts are redundant, and limits rounding errors if they are nearly redundant. The second
+value is used in the first ``_STRONG_STEPS`` steps of all attempts except the first. Without the second value, and with
+a constant rate in each attempt, 16 of 296 difficult problems from jumps stay unsolved instead of 3.
 """
 _STRONG_STEPS = wp.constant(6)
-"""Number of steps of an attempt with the second regularisation."""
+"""Number of steps of an attempt that use the second regularisation."""
 _POLISH_STEPS = wp.constant(2)
 """Number of polishing steps of the last attempt."""
 _POLISH_REGULARIZATION = wp.constant(real(1e-10))
@@ -100,7 +100,7 @@ _POLISH_FRACTION = wp.constant(real(1e-2))
     )
 )
 def speeds_by(delassus: wp.array2d[real], size: int, i: int, forces: wp.array[real]) -> Vec3:
-    """Return G_i f (native code of ``speeds_of``)."""
+    """Return G_i f, the velocity of contact ``i`` that ``forces`` cause (native code of ``speeds_of``)."""
     ...
 
 
@@ -149,8 +149,8 @@ def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
 
 @wp.func
 def projection_residual(contacts: Contacts, forces: wp.array[real], scale: real, length: real, newton: Newton):
-    """Evaluate P at ``length`` of the step from ``forces``, and return its largest component and its norm, both
-    divided by the rate, in m/s. They are infinite if any component is not finite.
+    """Evaluate P at the fraction ``length`` of the step from ``forces``. Return its largest component and its norm,
+    both divided by the rate, in m/s; infinite if any component is not finite.
     """
     if is_gpu() == 1:
         return residual_by_block(
@@ -190,7 +190,7 @@ def projection_residual(contacts: Contacts, forces: wp.array[real], scale: real,
 
 @wp.func
 def find_step(contacts: Contacts, forces: wp.array[real], scale: real, regularization: real, newton: Newton):
-    """Compute a Newton step from ``forces`` and its velocity change.
+    """Compute a Newton step from ``forces``, and the velocity change that it causes.
 
     On a GPU the block routines are tried first, for up to 120 and then up to 256 unknowns; if they fail, the
     elimination with row exchanges is used.
@@ -239,8 +239,8 @@ def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
 
 @wp.func
 def sweep_cooperative(contacts: Contacts, sweeps: int, forces: wp.array[real], newton: Newton):
-    """Perform ``sweep`` with a block of threads. For more contacts than ``sweep_by_block`` supports, every lane
-    computes each force, and each lane updates the velocities of some rows.
+    """Perform ``sweep`` with a block of threads. If there are more contacts than ``sweep_by_block`` supports, all lanes
+    compute the same forces, and each lane updates the velocities of some rows.
     """
     if is_gpu() == 0:
         sweep(contacts, sweeps, forces)
@@ -277,7 +277,7 @@ def sweep_cooperative(contacts: Contacts, sweeps: int, forces: wp.array[real], n
 
 @wp.func
 def advance(contacts: Contacts, forces: wp.array[real], length: real, newton: Newton):
-    """Move forces and velocities by ``length`` of the step, and clear it."""
+    """Move forces and velocities by the fraction ``length`` of the step, and clear the step."""
     for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
         forces[k] = forces[k] + length * newton.step[k]
         newton.velocities[k] = newton.velocities[k] + length * newton.velocity_change[k]
@@ -392,9 +392,9 @@ def coulomb_kernel(
 ):
     """Solve each problem for its contact forces.
 
-    ``vectors`` (B, 5, 3n), ``indices`` (B, 2, 3n) and ``matrices`` are the workspace of ``Newton``. ``forces`` are the
-    initial forces on entry and the best forces found, projected onto the cone, on return. ``residuals_out`` is their
-    residual in m/s, infinite where no forces were finite.
+    ``vectors`` (B, 5, 3n), ``indices`` (B, 2, 3n) and ``matrices`` are the workspace of ``Newton``. On entry,
+    ``forces`` are the initial forces; on return, the best forces found, projected onto the cone. ``residuals_out`` are
+    their residuals in m/s, infinite for problems without finite forces.
     """
     problem, lane = wp.tid()
     contacts = Contacts()

@@ -1,8 +1,8 @@
 """Block-cooperative routines of the Coulomb solve on a GPU: products, sweeps and residual (see
 ``kernels.contact.coulomb``).
 
-They compute the same sums as one thread on a CPU, in another order, and are not called on a CPU. All ``BLOCK`` threads
-of a block call each routine; its results are visible to all of them afterwards.
+They compute the same sums as one thread on a CPU, in a different order, and are not called on a CPU. All ``BLOCK``
+threads of a block call each routine; afterwards, its results are visible to all of them.
 """
 
 import warp as wp
@@ -17,7 +17,7 @@ BLOCK = 256
 MAX_SWEPT_CONTACTS = 128
 """Maximum number of contacts of ``sweep_by_block``."""
 SHARED_MEMORY_DOUBLES = 5264
-"""Size of the shared memory of a block in doubles: the maximum over the routines, which use it one after the other."""
+"""Size of the shared memory of a block, in doubles. The routines use it one after the other."""
 
 _RECIPROCALS = """
     // Reciprocal and reciprocal root to rounding, for normal numbers only.
@@ -38,7 +38,7 @@ _RECIPROCALS = """
 
 
 def gpu_or_cpu(body: str, *, otherwise: str = "") -> str:
-    """Return native code: ``body`` on a GPU, ``otherwise`` on a CPU, where it is not called."""
+    """Return native code that runs ``body`` on a GPU; on a CPU, where it is not called, it is ``otherwise``."""
     sizes = f"MAX_SWEPT = {MAX_SWEPT_CONTACTS}, SHARED_DOUBLES = {SHARED_MEMORY_DOUBLES}"
     definitions = f"{_RECIPROCALS}    constexpr int WARPS = {BLOCK // 32}, {sizes};\n"
     definitions += "    (void)WARPS, (void)MAX_SWEPT, (void)SHARED_DOUBLES;\n"
@@ -53,7 +53,7 @@ def gpu_or_cpu(body: str, *, otherwise: str = "") -> str:
 #endif
 """)
 def is_gpu() -> int:
-    """Return 1 on a GPU, 0 on a CPU; a compile-time constant, so that the other branch is not compiled."""
+    """Return 1 on a GPU, 0 on a CPU. It is a compile-time constant, so branches for the other device are dropped."""
     ...
 
 
@@ -210,7 +210,7 @@ def sweep_by_block(
     sweeps: int,
     forces: wp.array[real],
 ) -> None:
-    """Perform ``sweep`` over ``count`` contacts, 1 to ``MAX_SWEPT_CONTACTS``; ``shared_address`` is from
+    """Perform ``sweep`` over ``count`` contacts, 1 to ``MAX_SWEPT_CONTACTS``; ``shared_address`` is the result of
     ``shared_memory``.
     """
     ...

@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 _ACROSS = wp.constant(32)
 """Number of threads that share a row of the equations."""
 _SINGULAR = wp.constant(real(1e-14))
-"""Relative pivot threshold. An unknown whose pivot is smaller than this fraction of the largest so far stays zero."""
+"""Relative pivot threshold. An unknown stays zero if its pivot is not above this fraction of the largest so far."""
 
 
 @wp.struct
@@ -32,8 +32,9 @@ class Contacts:
     free_velocity: wp.array[real]
     """(3n,) m/s, contact velocities without contact forces."""
     normal_bias: wp.array[real]
-    """(n,) m/s, added to the normal velocities."""
+    """(n,) m/s, bias that is added to the normal velocities."""
     friction: real
+    """Coulomb coefficient mu."""
 
 
 @wp.struct
@@ -41,19 +42,23 @@ class Newton:
     """Workspace of the Newton method for 3n forces."""
 
     lane: int
+    """Index of the thread in its block."""
     velocities: wp.array[real]
+    """(3n,) m/s, contact velocities, including the normal bias."""
     residual: wp.array[real]
     """(3n,) newtons, residual of the projection equations."""
     step: wp.array[real]
+    """(3n,) newtons, full Newton step."""
     velocity_change: wp.array[real]
     """(3n,) m/s, change of the velocities in the full step."""
     best_forces: wp.array[real]
+    """(3n,) newtons, forces with the smallest residual so far."""
     unknowns: wp.array[int]
     """(3n,) components of the step that are unknowns of the linear equations."""
     pivots: wp.array[int]
     """(3n,) pivot column of each row."""
     matrix: wp.array2d[Vec4]
-    """(3n, >= (3n + 1) / 4) linear equations with the right side last; four columns are one vector."""
+    """(3n, >= (3n + 1) / 4) linear equations; four columns are one vector, and the right side is the last column."""
 
 
 @wp.struct
@@ -63,6 +68,7 @@ class Pivots:
     rank: int
     """Number of rows with a pivot."""
     largest: real
+    """Largest pivot so far."""
     panel_count: int
     """Number of pivots in the last panel."""
     parts: wp.vec4i
@@ -71,7 +77,7 @@ class Pivots:
 
 @wp.func
 def rate_of(contacts: Contacts, i: int, scale: real):
-    """Return the projection rate of contact ``i``, newtons per m/s."""
+    """Return the projection rate of contact ``i``, N s/m."""
     n = 3 * i
     trace = contacts.delassus[n, n] + contacts.delassus[n + 1, n + 1] + contacts.delassus[n + 2, n + 2]
     return scale * real(3.0) / trace
@@ -135,9 +141,10 @@ def write_row(
 ):
     """Write row ``a`` of the equations, from row ``row`` of the Jacobian.
 
-    ``weights`` are the coefficients of the contact's three rows of the Delassus operator, ``own`` its three additional
-    entries. Only the ``columns`` of unknowns are written; the contributions of known components of the step are moved
-    to the right side. On a GPU a warp writes the row, thread ``place`` of ``places`` (32) every 32nd entry.
+    The row is the sum of the contact's three rows of the Delassus operator with the coefficients ``weights``, plus the
+    three entries ``own`` in the columns of the contact. Only the ``columns`` of unknowns are written; the contributions
+    of known components of the step are moved to the right side. On a GPU a warp writes the row: thread ``place`` of
+    ``places`` (32) writes every 32nd entry.
     """
     ...
 
@@ -243,8 +250,8 @@ def pivot_row(
 
 @wp.func
 def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
-    """Find the pivots in the four columns of ``panel`` and eliminate within the panel. Below the pivots, the panel
-    then holds the multipliers of the pivot rows.
+    """Find the pivots in the four columns of ``panel`` and eliminate within the panel. Below the pivots, the panel then
+    contains the multipliers of the pivot rows.
     """
     lanes = wp.block_dim()
     pivots.panel_count = 0
@@ -302,7 +309,7 @@ def solve_alone(
     matrix: wp.array2d[Vec4],
     step: wp.array[real],
 ):
-    """Do the same as ``solve_equations`` in one CPU thread, sixteen columns at a time."""
+    """Solve for the step like ``solve_equations``, in one CPU thread, sixteen columns at a time."""
     ...
 
 

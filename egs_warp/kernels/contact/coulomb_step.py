@@ -327,8 +327,8 @@ def step_by_block(
 ) -> int:
     """Compute the Newton ``step`` of ``write_equations`` and ``solve_equations``, without row exchanges.
 
-    ``shared_address`` is from ``shared_memory``, ``values`` (3n,) the residual of the projection equations, ``change``
-    (3n,) scratch memory. Return 1; or 0, with an invalid step, if a pivot is not larger than ``min_pivot`` or there
-    are more than 120 unknowns.
+    ``shared_address`` is the result of ``shared_memory``, ``values`` (3n,) the residual of the projection equations,
+    and ``change`` (3n,) scratch memory. Return 1 on success. Return 0, with an invalid step, if a pivot is not larger
+    than ``min_pivot`` or there are more than 120 unknowns.
     """
     ...

@@ -1,5 +1,6 @@
-"""Newton step of the Coulomb solve by a block of threads on a GPU, for 121 to 256 unknowns: the method of
-``coulomb_step`` in passes of 64 columns.
+"""Newton step of the Coulomb solve by a block of threads on a GPU, for 121 to 256 unknowns.
+
+The method is the same as in ``coulomb_step``, in passes of 64 columns.
 """
 
 import warp as wp
@@ -227,7 +228,7 @@ def wide_step_by_block(
     change: wp.array[real],
     matrix: wp.array2d[Vec4],
 ) -> int:
-    """Do the same as ``step_by_block`` for 121 to 256 unknowns, and return 0 for other numbers too. ``matrix`` is
-    scratch memory.
+    """Compute the Newton step like ``step_by_block``, for 121 to 256 unknowns; return 0 for other numbers of unknowns
+    too. ``matrix`` is scratch memory.
     """
     ...

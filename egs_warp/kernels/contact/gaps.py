@@ -10,7 +10,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def embedded_point(tet: wp.vec4i, w: Vec4, positions: wp.array2d[Vec3], world: int):
-    """Return the position of the point with the weights ``w`` in the tetrahedron of the nodes ``tet``."""
+    """Return the position of the point with barycentric weights ``w`` in the tetrahedron with the nodes ``tet``."""
     return (
         w[0] * positions[world, tet[0]]
         + w[1] * positions[world, tet[1]]
@@ -35,8 +35,8 @@ def point_gaps_kernel(
     """Compute the signed distance of each embedded point of each world to the nearest solid, and the plane of that
     solid with the largest signed distance.
 
-    The planes of a solid, which is their intersection, are consecutive. The largest signed distance to them is taken as
-    the distance to the solid, of which it is a lower bound.
+    A solid is the intersection of the half spaces behind its planes, which are consecutive. The largest signed distance
+    to its planes is used as the distance to the solid; it is a lower bound of the true distance.
     """
     world, point = wp.tid()
     x = embedded_point(nodes[point], weights[point], positions, world)
@@ -134,8 +134,9 @@ def all_gaps_kernel(
     gaps_out: wp.array2d[real],
     planes_out: wp.array2d[int],
 ):
-    """Do the same as ``point_gaps_kernel`` for all points of a world in one CPU thread. Arrays must be contiguous.
-    ``heights`` is a workspace of planes times nodes for the signed distances of the nodes, which are interpolated
-    linearly; the worlds of a launch on a CPU run one after the other and share it.
+    """Compute the gaps like ``point_gaps_kernel``, for all points of a world in one CPU thread.
+
+    Arrays must be contiguous. ``heights`` (planes x nodes,) is a workspace for the signed distances of the nodes, which
+    are interpolated linearly. The worlds of a launch on a CPU run one after the other and share it.
     """
     write_gaps(nodes, weights, planes, solid_from_plane, positions, wp.tid(), heights, gaps_out, planes_out)

@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def spline_weights(f: real):
     """Return the weights of a quadratic B-spline at the previous, the nearest and the next node; ``f`` is the offset
-    from the nearest in spacings.
+    from the nearest node, in spacings.
     """
     half = real(0.5)
     return Vec3(half * (half - f) * (half - f), real(0.75) - f * f, half * (half + f) * (half + f))
@@ -78,8 +78,8 @@ def ground_gaps_kernel(
     """Compute the distance of each embedded point of each world to the tangent plane of the ground below it, and merge
     it into ``gaps``.
 
-    Where the ground is nearer than the obstacle in ``gaps``, its distance is stored and ``faces`` becomes 0. Elsewhere
-    ``faces`` is incremented by 1, since the ground is face 0.
+    If the ground is nearer than the obstacle in ``gaps``, the distance of the ground is stored and ``faces`` becomes 0.
+    Otherwise ``faces`` is incremented by 1, since the ground is face 0.
     """
     world, point = wp.tid()
     x = embedded_point(nodes[point], weights[point], positions, world)

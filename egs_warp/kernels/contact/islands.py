@@ -1,4 +1,4 @@
-"""Islands: the sets of bodies that contacts between them connect."""
+"""Islands: sets of bodies that are connected by contacts."""
 
 import warp as wp
 
@@ -13,10 +13,11 @@ def islands_kernel(
     # Out:
     islands_out: wp.array2d[int],
 ):
-    """Write, for each world, the lowest body of the island of each body (union-find).
+    """Write the lowest body index in the island of each body, for each world (union-find).
 
-    The first ``counts`` of the ``pairs`` (B, K) are the bodies of each contact; a negative one is an obstacle, which
-    connects nothing. The root of a tree is its lowest body, so the result does not depend on the order of the contacts.
+    The first ``counts`` of the ``pairs`` (B, K) are the two bodies of each contact. A negative index is an obstacle,
+    which connects nothing. The root of a tree is its lowest body, so the result does not depend on the order of the
+    contacts.
     """
     world = wp.tid()
     for body in range(islands_out.shape[1]):

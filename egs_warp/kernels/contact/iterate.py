@@ -1,8 +1,8 @@
-"""Kernels that evaluate a trial of Newton's method on steps with contact, one thread for each node or contact of each
-world (Eq. 4, 8).
+"""Kernels that evaluate a trial of Newton's method on steps with contact, with one thread for each node or contact of
+each world (Eq. 4, 8).
 
-The host code is ``egs_warp/contact/trial.py``, and ``device_newton_workspace.py`` for the first and the last kernel;
-``iterate_cpu`` is the version on a CPU.
+The host code is in ``egs_warp/contact/trial.py``; ``device_newton_workspace.py`` launches the first and the last
+kernel. ``iterate_cpu`` contains the kernels for a CPU.
 """
 
 import warp as wp
@@ -22,7 +22,7 @@ def select_base_kernel(
     # Out:
     base_out: wp.array[real],
 ):
-    """Overwrite the base with the ``trial`` if ``slot`` is 1, with ``start`` if it is 2; keep it if it is 0."""
+    """Overwrite the base with ``trial`` if ``slot`` is 1, or with ``start`` if it is 2; do nothing if it is 0."""
     i = wp.tid()
     if slot[0] == real(1.0):
         base_out[i] = trial[i]
@@ -47,8 +47,8 @@ def trial_kernel(
     """Move the velocities of each world along a Newton step by the fraction in ``lengths``, and compute the end
     positions of the nodes.
 
-    The full step ends at ``free_velocities`` (without contact forces) plus ``force_velocities`` (their effect). At
-    length 0 they need not be finite.
+    The full step ends at ``free_velocities``, without contact forces, plus ``force_velocities``, the effect of the
+    contact forces. At length 0 both are ignored and need not be finite.
     """
     world, node = wp.tid()
     length = lengths[world]
@@ -101,9 +101,9 @@ def residual_kernel(
     free_out: wp.array2d[Vec3],
     rest_out: wp.array2d[Vec3],
 ):
-    """Compute ``StepProblem.residual`` of all worlds in N s, without contact forces and with them.
+    """Compute the residual of all worlds in N s (``ImplicitStep.residual``), without and with contact forces.
 
-    ``internal`` is the internal gradient, in newtons (minus the forces), and ``torque`` its torque in N m.
+    ``internal`` is the internal gradient in newtons, minus the internal forces; ``torque`` is its torque in N m.
     """
     world, node = wp.tid()
     spin = dt * (inverse_inertia[world] * torque[world])
@@ -124,8 +124,8 @@ def free_velocity_kernel(
     # Out:
     free_velocities_out: wp.array[Vec3],
 ):
-    """Compute the velocities after a Newton step without contact forces. ``rotation_response`` (3N, 3) times
-    ``rotation`` is the momentum correction added to ``solved``.
+    """Compute the velocities after a Newton step without contact forces. The momentum projection adds
+    ``rotation_response`` (3N, 3) times ``rotation`` to ``solved``.
     """
     node = wp.tid()
     correction = Vec3(real(0.0))

@@ -1,7 +1,7 @@
-"""Kernels of a Newton iterate on a CPU, in one thread each: a trial, and the Newton step from there (Eq. 4, 8).
+"""Kernels that evaluate a Newton iterate on a CPU, each in one thread: a trial, and the Newton step from it (Eq. 4, 8).
 
-The host code is ``egs_warp/contact/host_newton.py``; ``iterate`` is the version on a GPU. uint64 arguments are
-addresses of host arrays.
+The host code is in ``egs_warp/contact/host_newton.py``; ``iterate`` contains the kernels for a GPU. Arguments of type
+uint64 are addresses of host arrays.
 """
 
 import warp as wp
@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Step:
-    """Data of ``fem.StepProblem`` for N nodes."""
+    """Data of a ``fem.StepProblem`` with N nodes."""
 
     positions: wp.array[real]
     """(3N,) m, at the start of the step."""
@@ -32,7 +32,7 @@ class Step:
     inverse_inertia: wp.array[real]
     """(9,) 1/(kg m^2), inverse inertia tensor."""
     masses: wp.array[real]
-    """(N,) kg."""
+    """(N,) kg, lumped masses."""
 
 
 @wp.func_native(
@@ -135,8 +135,8 @@ def step_residual(
     free_residual_out: wp.uint64,
     residual: wp.array2d[real],
 ) -> real:
-    """Compute ``StepProblem.residual`` without contact forces (3N,) and with them (N, 3), N s, and return the norm
-    of the latter.
+    """Compute the residual (``ImplicitStep.residual``) in N s, without contact forces (3N,) and with them (N, 3);
+    return the norm of the residual with contact forces.
     """
     ...
 
@@ -170,8 +170,8 @@ def add_low_rank(
     scratch: wp.array[real],
     solved: wp.uint64,
 ) -> None:
-    """Correct the solution ``solved`` (3N,) with the sparse factors for the sum of ``directions`` rank-one terms, by
-    Woodbury's formula (see ``MultifrontalLdl.add_low_rank``).
+    """Correct ``solved`` (3N,), a solution with the sparse factors, for the sum of ``directions`` rank-one terms that
+    is added to the matrix, by the Woodbury formula (see ``MultifrontalLdl.add_low_rank``).
     """
     ...
 
@@ -203,7 +203,7 @@ def apply_update(
     solved: wp.uint64,
     contact_velocities_out: wp.uint64,
 ) -> None:
-    """Overwrite ``solved`` (3N,) with ``velocities`` (3N,) minus it, and compute the contact velocities (3n,) there."""
+    """Overwrite ``solved`` (3N,) with ``velocities`` - ``solved``, and compute the contact velocities (3n,) there."""
     ...
 
 
@@ -236,8 +236,8 @@ def trial_kernel(
     free_residual_out: wp.uint64,
     norm_out: wp.array[real],
 ):
-    """Run ``advance_trial``, the internal gradient and ``step_residual``. With ``length`` 0, ``free_velocities`` and
-    ``columns`` are not read.
+    """Run ``advance_trial``, compute the internal gradient, and run ``step_residual``. If ``length`` is 0,
+    ``free_velocities`` and ``columns`` are not read.
     """
     advance_trial(
         step.positions, dt, base, free_velocities, columns, 3 * contacts, forces, target_forces, length,

@@ -13,7 +13,7 @@ class LevelSetLattice:
     """Lattice of the coefficients of a level set."""
 
     counts: wp.vec3i
-    """Nodes along each axis; the coefficients are stored with the last axis innermost."""
+    """Number of nodes along each axis; the coefficients are stored with the last axis innermost."""
     origin: Vec3
     """Position of node (0, 0, 0), m."""
     spacing: real
@@ -24,7 +24,8 @@ class LevelSetLattice:
 def level_set_value_and_gradient(lattice: LevelSetLattice, coefficients: wp.array[float], x: Vec3) -> Vec4:
     """Return the gradient at ``x`` and, as the last component, the value in metres.
 
-    Outside the lattice the value is that of the nearest point of the lattice plus the distance to it.
+    The spline is defined on the lattice except its outermost half cells. Outside this domain, the value is the value at
+    the nearest point of the domain plus the distance to that point.
     """
     u = (x - lattice.origin) / lattice.spacing
     f = Vec3()
@@ -80,7 +81,7 @@ def level_set_kernel(
     gradients_out: wp.array[Vec3],
     values_out: wp.array[real],
 ):
-    """Evaluate the level set at each point."""
+    """Evaluate the level set and its gradient at each point."""
     i = first_row + wp.tid()
     value = level_set_value_and_gradient(lattice, coefficients, points[i])
     gradients_out[i] = Vec3(value[0], value[1], value[2])

@@ -7,8 +7,8 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 REFACTOR_RATIO = 0.7
-"""The tangent is updated if a step leaves more than this fraction of the residual. The first step of a round is
-exempt, because it creates the forces of new contacts. A new tangent takes as long as many steps.
+"""The tangent is updated if a step leaves more than this fraction of the residual. The first step of a round is exempt,
+because it creates the forces of new contacts. Computing a new tangent takes as long as many steps.
 """
 MIN_DECREASE = 1e-4
 """Sufficient decrease of a full step, as a fraction of the largest recent residual."""
@@ -18,7 +18,7 @@ MIN_STEP_LENGTH = 1e-3
 """Step length below which the line search fails, as a fraction of a Newton step."""
 MAX_COULOMB_FAILURES = 3
 """Maximum number of Newton steps of a round whose forces violate Coulomb's law by more than the tolerance. With more,
-the solve fails and the step is halved.
+the solve fails.
 """
 (
     STEPS,
@@ -35,17 +35,27 @@ the solve fails and the step is halved.
     MAX_STEPS,
     RECENT_RESIDUALS,
 ) = range(13)
-"""Columns of the progress of a world: steps of the round so far, residual at the start of the next step (-1: that of
-the last trial), residual before the last trial, fraction of the Newton step of the next trial, steps that violated
-Coulomb's law, 1 if the tangent is that of the present velocities, outcome of the last trial, unit of the residuals of
-trials (the stored ones are divided by it), tolerances (``NewtonProgress``), step limit, and ``RESIDUAL_WINDOW`` recent
-residuals, -1 where there is none.
+"""Columns of the progress of a world, in this order:
+
+* ``STEPS``: number of completed steps of the round;
+* ``RESIDUAL``: residual at the start of the next step, -1 if the host does not know it yet;
+* ``PREVIOUS_RESIDUAL``: residual at the start of the last step;
+* ``LENGTH``: fraction of the Newton step that the next trial takes;
+* ``COULOMB_FAILURES``: number of steps whose forces violated Coulomb's law;
+* ``TANGENT_IS_CURRENT``: 1 if the tangent was computed at the current velocities;
+* ``OUTCOME``: outcome of the last trial;
+* ``UNIT``: unit of the residuals of trials, by which they are divided before they are stored;
+* ``TOLERANCE``, ``ACTIVATION_RESIDUAL``, ``COULOMB_TOLERANCE``: tolerances, see ``NewtonProgress``;
+* ``MAX_STEPS``: number of steps at which a loop on a GPU returns to the host;
+* ``RECENT_RESIDUALS``: the first of ``RESIDUAL_WINDOW`` columns of recent residuals, -1 if there are fewer.
 """
 ROW_SIZE = RECENT_RESIDUALS + RESIDUAL_WINDOW
+"""Number of columns of the progress."""
 ACCEPTED, SHORTEN, NEEDS_TANGENT, ENDED, NEAR_END, FAILED, REPEAT = 1, 2, 4, 8, 16, 32, 64
-"""Bits of an outcome. ``ACCEPTED``: the trial is the new iterate. ``SHORTEN``: try half of the step. ``NEEDS_TANGENT``:
-update the tangent before the next step. ``ENDED``: the equations hold. ``NEAR_END``: search for points that penetrate
-too far. ``FAILED``: give up. ``REPEAT``: the Coulomb solve failed numerically; nothing was decided.
+"""Bits of an outcome. ``ACCEPTED``: the trial is the new iterate. ``SHORTEN``: try half the step length.
+``NEEDS_TANGENT``: update the tangent before the next step. ``ENDED``: the equations hold to the tolerances.
+``NEAR_END``: search for points that penetrate too far. ``FAILED``: end the round without convergence. ``REPEAT``: the
+Coulomb solve failed numerically and must be repeated; the trial has not been judged.
 """
 
 _REFACTOR_RATIO, _MIN_DECREASE, _WINDOW = (
@@ -74,8 +84,8 @@ def begin_loop_kernel(
     # Out:
     running_out: wp.array[int],
 ):
-    """Prepare the rows of ``progress`` for a loop of trials: clear the outcome, take an unknown residual from
-    ``sizes``, that of the last trial, and set the loop condition to ``enabled``.
+    """Prepare the rows of ``progress`` for a loop of trials: clear the outcome, replace an unknown residual by the
+    residual ``sizes`` of the last trial, and set the loop condition to ``enabled``.
     """
     world = wp.tid()
     if progress[world, _RESIDUAL] < real(0.0):
@@ -126,7 +136,7 @@ def judge_step(progress: wp.array2d[real], world: int, size: real, violation: re
         progress[world, _RECENT + k] = progress[world, _RECENT + k + 1]
     progress[world, _RECENT + _WINDOW - 1] = size
     progress[world, _RESIDUAL] = size
-    # By linearity, the contact velocities after a full step are those of the Coulomb solve.
+    # By linearity, the Coulomb solve has computed the contact velocities after a full step, so they satisfy the law.
     is_consistent = length == real(1.0) and not is_violated
     if not is_consistent or (not is_first and size > _REFACTOR_RATIO * before):
         outcome |= _NEEDS_TANGENT
@@ -153,11 +163,15 @@ def judge_steps_kernel(
     # Out:
     running_out: wp.array[int],
 ):
-    """Judge the last trial of each world, and decide whether a loop on the device may go on without the host.
+    """Judge the last trial of each world, and decide whether a loop on the device may continue without the host.
 
-    Trials ended at the residuals ``sizes``, in the unit of the row. Their forces violate Coulomb's law by
-    ``violations`` in m/s, where more than ``failure_tolerance`` is a numerical failure, and ``penetrating`` points
-    penetrate too far.
+    Args:
+        failure_tolerance: violation in m/s above which the Coulomb solve has failed numerically.
+        sizes: (c,) residuals of the trials, in the ``UNIT`` of the row.
+        violations: (c,) m/s, violations of Coulomb's law by the forces of the trials.
+        penetrating: (c,) number of points that penetrate too far.
+        progress: (c, ``ROW_SIZE``) progress, updated.
+        running_out: (c,) 1 if the loop may continue, else 0.
     """
     world = wp.tid()
     outcome = judge_step(progress, world, sizes[world] / progress[world, _UNIT], violations[world], failure_tolerance)

@@ -1,4 +1,4 @@
-"""Contact between the embedded points of a body and the level set of another, through its deformed tetrahedra.
+"""Contact between the embedded points of one body and the level set of another body through its deformed tetrahedra.
 
 A point of body a at x lies in a tetrahedron of body b with barycentric weights w. At rest the same weights give X =
 sum w_i X_i, where the level set phi of b is evaluated. With the deformation gradient F of the tetrahedron and g = F^-T
@@ -16,7 +16,7 @@ from egs_warp.precision import Mat33, Vec3, Vec4, real
 wp.set_module_options({"enable_backward": False})
 
 MIN_SLOPE = wp.constant(wp.float64(0.5))
-"""Minimum |grad phi| of a gap. Near the middle of a body the slope of its level set vanishes."""
+"""Lower bound of |grad phi| in the gap, because the slope of a level set vanishes near the middle of the body."""
 
 
 @wp.func
@@ -42,8 +42,9 @@ def weights_in_tet(corners: wp.vec4i, positions: wp.array2d[Vec3], world: int, x
 
 @wp.func
 def tet_at_point(x: Vec3, world: int, tets: wp.array[wp.vec4i], positions: wp.array2d[Vec3], boxes: wp.uint64) -> int:
-    """Return the deformed tetrahedron whose minimum barycentric weight at ``x`` is the largest, of several the first,
-    among those whose box contains ``x``; -1 if there is none. ``boxes`` has a group for each world.
+    """Return the deformed tetrahedron in which the minimum barycentric weight of ``x`` is largest; the lowest index if
+    several are equal. Only tetrahedra whose boxes contain ``x`` are tested; -1 if there are none. ``boxes`` has a group
+    for each world.
     """
     coarse = single(x)
     query = wp.bvh_query_aabb(boxes, coarse, coarse, wp.bvh_get_group_root(boxes, world))
@@ -69,8 +70,8 @@ def normal_and_gap(
     lattice: LevelSetLattice,
     coefficients: wp.array[float],
 ) -> Vec4:
-    """Return the normal at a point and, as the last component, its gap in metres. Where the level set has no slope, the
-    normal is zero and the gap infinite.
+    """Return the normal at a point and, as the last component, its gap in metres. If the gradient of the level set
+    vanishes there, the normal is zero and the gap infinite.
     """
     level = level_set_value_and_gradient(lattice, coefficients, embedded_point(corners, weights, rest, 0))
     gradient = Vec3(level[0], level[1], level[2])
@@ -86,8 +87,8 @@ def normal_and_gap(
 
 @wp.func
 def frame_of_normal(n: Vec3) -> Mat33:
-    """Return the contact frame with rows n, t1, t2 for a unit normal. It is continuous except where |n_x| is 0.8, so
-    that rounding of a normal along an axis does not change it.
+    """Return the contact frame with rows n, t1, t2 for a unit normal ``n``. It is continuous except where |n_x| is 0.8,
+    so for a normal along an axis it does not depend on rounding.
     """
     helper = Vec3(real(1.0), real(0.0), real(0.0))
     if wp.abs(n[0]) > real(0.8):
@@ -139,8 +140,8 @@ def pair_gaps_kernel(
     gaps_out: wp.array2d[real],
     tets_out: wp.array2d[int],
 ):
-    """Compute the gap of each point of body a to body b, and the tetrahedron of b at the point; infinite and -1 away
-    from all of them.
+    """Compute the gap of each point of body a to body b, and the tetrahedron of b at the point. If no box of a
+    tetrahedron contains the point, they are infinite and -1.
     """
     world, point = wp.tid()
     x = embedded_point(nodes[point], weights[point], positions, world)
@@ -181,8 +182,9 @@ def pair_record_kernel(
     """Write nodes and weights on both sides, frame and gap of the first ``counts`` of the ``points`` (B, K) of body a
     against body b, and zeros as padding.
 
-    A point that is away from all tetrahedra of b now, but not at the end of the step, has the tetrahedron of
-    ``end_tets`` (B, P), with weights that extrapolate. Without one, the axes are zero and the gap is infinite.
+    A point may lie outside all boxes of b's tetrahedra at the start of the step, but not at its end. It is then
+    extrapolated in the tetrahedron ``end_tets`` (B, P). If there is none either, the axes are zero and the gap is
+    infinite.
     """
     world, k = wp.tid()
     record_nodes = wp.vec4i()

@@ -1,6 +1,7 @@
 """Kernels of contact selection: the lowest point of each cell, hysteresis, and points that penetrate too far (Eq. 8).
 
-All have a leading world axis. On a GPU ``BLOCK`` threads share a cell or a world, on a CPU one thread computes it.
+The first launch dimension is the world. On a GPU, ``BLOCK`` threads share a cell or a world; on a CPU, one thread
+computes it.
 """
 
 import warp as wp
@@ -16,10 +17,11 @@ BLOCK = 64
 
 @wp.func
 def lowest_of_block(order: wp.array[int], height: real, first: real):
-    """Return the point of the block with the lowest ``height``, of several the first in ``order``, or -1.
+    """Return the point with the lowest ``height`` of all threads of the block; of several, the first in ``order``; -1
+    if there is none.
 
-    Each thread passes its lowest height and the position in ``order`` of its first point there, infinite if it has no
-    point.
+    Each thread passes the lowest height of its points, and as ``first`` the position in ``order`` of its first point
+    with this height, infinite if it has no points.
     """
     lowest_height = -block_max(-height)
     sync_block()
@@ -44,10 +46,10 @@ def lowest_point_per_cell_kernel(
     # Out:
     lowest_out: wp.array2d[int],
 ):
-    """Find the lowest point of each cell among those closer than ``near``; -1 if there is none.
+    """Find the lowest point of each cell among its points with gaps below ``near`` metres; -1 if there are none.
 
-    The points of a cell are ``order[bounds[cell]:bounds[cell + 1]]``. Gaps that are equal within ``gap_tolerance`` tie,
-    and the first point in ``order`` wins.
+    The points of a cell are ``order[bounds[cell]:bounds[cell + 1]]``. Gaps are rounded to multiples of
+    ``gap_tolerance``; of points with equal rounded gaps, the first in ``order`` is selected.
     """
     world, cell, lane = wp.tid()
     min_height = real(wp.inf)
@@ -84,11 +86,12 @@ def penetrating_points_kernel(
     # Out:
     lowest_out: wp.array2d[int],
 ):
-    """Count the points of each world that penetrate too far and are not among its first ``counts`` ``points``, and find
-    the lowest of them in each cell, as ``lowest_point_per_cell_kernel`` does.
+    """Count the points of each world that penetrate too far and are not contacts, and find the lowest of them in each
+    cell, as ``lowest_point_per_cell_kernel`` does.
 
-    A point is counted if it is deeper than ``depth`` metres and has sunk by more than ``tolerance`` times ``max_sink``,
-    or times ``max_creep`` if it is deeper than ``tolerance``.
+    The contacts of a world are the first ``counts`` of its ``points``. A point penetrates too far if it is deeper than
+    ``depth`` metres and has sunk by more than ``max_sink`` times ``tolerance``, or by more than ``max_creep`` times
+    ``tolerance`` if it is deeper than ``tolerance``.
     """
     world, cell, lane = wp.tid()
     min_height = real(wp.inf)
@@ -139,8 +142,9 @@ def select_points_kernel(
 ):
     """Select the points of a step by the rules of ``ContactSelector``, in ascending order.
 
-    ``previous`` and ``loaded`` are (B, L), ``gaps`` (B, P) at the predicted end, ``lowest`` (B, C) the lowest active
-    point of each cell; ``candidates`` (B, L + C) is a workspace.
+    ``previous`` (B, L) are the points of the previous step, ``loaded`` (B, L) is 1 for points that carried load,
+    ``gaps`` (B, P) are the gaps at the predicted end, and ``lowest`` (B, C) is the lowest active point of each cell;
+    ``candidates`` (B, L + C) is a workspace.
     """
     world, lane = wp.tid()
     slots = previous.shape[1]
@@ -158,7 +162,7 @@ def select_points_kernel(
             if loaded[world, k] == 0 and lowest[world, cell] >= 0:
                 limit = gaps[world, lowest[world, cell]] + hysteresis
             if gap < real(2.0) * activation_distance and gap <= limit:
-                # The cell adds no further point. All threads that write here write the same.
+                # The cell adds no further point. All threads that write this entry write the same value.
                 candidates[world, slots + cell] = -1
                 candidate = point
         candidates[world, k] = candidate
@@ -190,8 +194,10 @@ def append_points_kernel(
     points: wp.array2d[int],
     counts: wp.array[int],
 ):
-    """Append the points in ``lowest`` (B, C) that are not negative to the first ``counts`` of ``points`` (B, K), in
-    ascending order of their ``gaps`` (B, P), rounded to ``gap_tolerance``, and then of their indices.
+    """Append the points in ``lowest`` (B, C) that are not negative to the first ``counts`` of ``points`` (B, K).
+
+    They are sorted by their ``gaps`` (B, P), rounded to multiples of ``gap_tolerance``, and points with equal rounded
+    gaps by their indices.
     """
     world, lane = wp.tid()
     first = counts[world]

@@ -89,7 +89,8 @@ def damping_block(
         f_a: F g_a.
         f_b: F g_b.
         along: g_a.g_b.
-        rotation_term: g_a.S g_b, the factor of I from the derivative of F; the other terms come from that of S.
+        rotation_term: g_a.S g_b, the factor of I from the derivative of F; the other terms come from the derivative of
+            S.
         dt: step size, s.
         mu: first Lame parameter.
         lam: second Lame parameter.
@@ -221,9 +222,9 @@ def segment_forces_kernel(
     # Out:
     forces_out: wp.array2d[Vec3],
 ):
-    """Compute T phi u of each segment (Eq. 7), with phi as in ``muscles.tension.force_length_factor``.
+    """Compute the force T phi u of each segment (Eq. 7), with phi as in ``muscles.tension.force_length_factor``.
 
-    One warp per world and segment (on a CPU one thread).
+    A warp computes each segment of each world; on a CPU, one thread.
     """
     world, segment, lane = wp.tid()
     vector = Vec3(real(0.0))
@@ -257,7 +258,7 @@ def gather_forces_kernel(
 ):
     """Sum the values of each node's corners and, if there are muscles, of its segment ends.
 
-    One warp per world and node.
+    A warp computes each node of each world; on a CPU, one thread.
     """
     world, node, lane = wp.tid()
     total = Vec3(real(0.0))
@@ -290,8 +291,8 @@ def element_hessians_kernel(
 ):
     """Compute the Hessian of Eq. (5) for each element.
 
-    Block (a, b) = V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T], h = F^-T g. The Hessian of the
-    damping (Eq. 6) over a step of dt is added if dt is not 0.
+    Block (a, b) is V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T] with h = F^-T g. If dt is not 0,
+    the Hessian of the damping (Eq. 6) over a step of dt seconds is added.
     """
     world, e = wp.tid()
     rest_inverse = rest_inverses[e]

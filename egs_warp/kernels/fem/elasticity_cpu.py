@@ -1,6 +1,6 @@
-"""``kernels.fem.elasticity`` on a CPU: vectors of four tetrahedra, summed in a fixed order by one thread.
+"""Kernels of ``kernels.fem.elasticity`` for a CPU: four tetrahedra per vector, summed in a fixed order by one thread.
 
-Host code: ``egs_warp.fem.simd_elasticity``.
+The host code is in ``egs_warp.fem.simd_elasticity``.
 """
 
 import warp as wp
@@ -77,24 +77,26 @@ class Elements:
     """Mesh in groups of ``LANES`` tetrahedra; T is padded to a multiple of ``LANES``."""
 
     corners: wp.array[wp.int32]
-    """(T, 4) nodes, flat."""
+    """(T, 4) nodes of each tetrahedron, flat."""
     rests: wp.array[real]
     """(T / 4, 9, 4) 1/m, inverse edge matrices at rest, row by row, flat."""
     volumes: wp.array[real]
-    """(T,) m^3; 0 for padding."""
+    """(T,) m^3, volumes at rest; 0 for padding."""
     entries: wp.array[wp.int32]
-    """(T, 78) matrix entry of each number of the blocks ``PAIRS``, row by row; upper triangles of blocks (a, a)."""
+    """(T, 78) matrix entries of each tetrahedron, for the blocks ``PAIRS`` in order, row by row; blocks (a, a) have
+    only their upper triangles.
+    """
     mu: real
     """First Lame parameter, Pa."""
     lam: real
     """Second Lame parameter, Pa."""
     damping_time: real
-    """beta, s."""
+    """Rayleigh coefficient beta, s."""
 
 
 @wp.struct
 class MuscleSegments:
-    """Muscle segments (``elasticity.segment_forces_kernel``), possibly none."""
+    """Data of M >= 0 muscle segments (``elasticity.segment_forces_kernel``)."""
 
     offsets: wp.array[wp.int32]
     """(M + 1,) offset of each segment in ``nodes`` and ``weights``."""
@@ -103,9 +105,9 @@ class MuscleSegments:
     weights: wp.array[real]
     """Weights of these nodes; the segment vector is the weighted sum of their positions."""
     rest_lengths: wp.array[real]
-    """(M,) m."""
+    """(M,) m, rest lengths."""
     tensions: wp.array[real]
-    """(M,) N."""
+    """(M,) N, tensions."""
     length_zero_force: real
     """Relative length at and below which a segment exerts no force."""
     length_full_force: real
@@ -497,8 +499,8 @@ def hessian_kernel(
 ) -> None:
     """Compute ``factor`` times the upper entries of the assembled element Hessians.
 
-    The Hessians are those of ``element_projected_hessians_kernel`` if ``projected`` is nonzero, with ``tolerance`` and
-    ``max_sweeps`` for its Jacobi iteration, and otherwise those of ``element_hessians_kernel``.
+    The element Hessians are defined in ``element_hessians_kernel`` or, if ``projected`` is nonzero, in
+    ``element_projected_hessians_kernel``, with ``tolerance`` and ``max_sweeps`` for the Jacobi iteration.
     """
     if projected != 0:
         projected_hessian_native(elements, positions, starts, dt, factor, tolerance, max_sweeps, entries_out)

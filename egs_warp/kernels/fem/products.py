@@ -1,6 +1,6 @@
 """Products of a sparse symmetric matrix with panels of vectors, and of panels with each other, on a CPU.
 
-Threads take panels from a shared counter, so that a slow or late thread processes fewer. Host code:
+Threads take panels from a shared counter, so a slow or late thread processes fewer panels. The host code is in
 ``egs_warp.fem.multifrontal``.
 """
 
@@ -12,8 +12,8 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 PANEL, STRIP = 16, 8
-"""Number of vectors in a panel, which is stored with one row per unknown, and number of vectors that one pass over the
-matrix processes."""
+"""Number of vectors in a panel, and number of vectors that one pass over the matrix processes. Panels are stored with
+one row per unknown."""
 
 
 @wp.struct
@@ -25,9 +25,9 @@ class Rows:
     indices: wp.array[wp.int32]
     """(nnz,) columns."""
     first_of_equal_rows: wp.array[wp.int32]
-    """(n,) 0 for rows with the same columns as the row before, else 1."""
+    """(n,) 0 for rows with the same columns as the previous row, else 1."""
     values: wp.array[real]
-    """(nnz,)."""
+    """(nnz,) entries."""
 
 
 @wp.func_native("return __atomic_fetch_add(&counters.data[which], 1, __ATOMIC_ACQ_REL);")
@@ -96,7 +96,7 @@ def multiply_strip(
         rows: number of rows n.
         offsets: (n + 1,) row offsets.
         indices: (nnz,) columns.
-        first_of_equal_rows: (n,) 0 for rows with the same columns as the row before.
+        first_of_equal_rows: (n,) 0 for rows with the same columns as the previous row, else 1.
         values: (nnz,) entries.
         vectors: address of (n, columns) float64.
         columns: row length of the vectors and the products.
@@ -128,8 +128,8 @@ def finish_moves(
 ) -> None:
     """Finish a panel of displacements and compute its linear terms.
 
-    The function subtracts ``reference`` from the last column of all panels if that column is in this panel, clears the
-    columns behind it, and writes X^T g.
+    If the panel contains the last column of all panels, the function subtracts ``reference`` from it and clears the
+    columns behind it. Then it writes X^T g.
 
     Args:
         columns: number of columns in this and the following panels.
@@ -177,5 +177,7 @@ def write_quadratic(
     products: wp.array2d[real],
     quadratic: wp.array2d[real],
 ) -> None:
-    """Write block (first, second) of X^T Y, and its transpose; X are the displacements, Y = H X, X^T Y is symmetric."""
+    """Write block (first, second) of the symmetric matrix X^T Y, and its transpose at (second, first). X are the
+    displacements (``moves``) and Y = H X the ``products``.
+    """
     ...

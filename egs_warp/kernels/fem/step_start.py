@@ -1,4 +1,4 @@
-"""Kernel that computes the start of a step on a GPU: lever arms, rigid modes, inverse inertia and the rigid guess.
+"""Kernel that computes the start of a step in each world: lever arms, rotation modes, inverse inertia and rigid guess.
 
 Its first launch dimension is the world.
 """
@@ -11,12 +11,12 @@ from egs_warp.precision import Mat33, Vec3, real
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 256
-"""Number of threads of the block on a GPU."""
+"""Number of threads for each world on a GPU."""
 
 
 @wp.func
 def block_sum(value: Vec3):
-    """Return the sum of the threads' vectors."""
+    """Return the sum of ``value`` over the threads of the block."""
     first = sum_of_block(value[0])
     sync_block()
     second = sum_of_block(value[1])
@@ -28,7 +28,7 @@ def block_sum(value: Vec3):
 
 @wp.func
 def rotation_displacement(rotation: Vec3, arm: Vec3):
-    """Return the displacement of ``arm`` under the rotation vector ``rotation``, radians (Rodrigues)."""
+    """Return the displacement of the lever arm ``arm`` under the rotation vector ``rotation``, rad (Rodrigues)."""
     angle = wp.length(rotation)
     once = real(1.0)
     twice = real(0.5)
@@ -55,7 +55,7 @@ def step_start_kernel(
     guess_out: wp.array2d[Vec3],
 ):
     """Compute ``lever_arms`` (B, N), ``rotation_modes`` (B, 3N, 3), ``inverse_inertia`` (B,) and ``rigid_guess`` (B, N)
-    of ``StepProblem`` for steps of ``dt`` seconds; one block of threads per world, or one thread on a CPU.
+    of ``StepProblem`` for steps of ``dt`` seconds. A block of threads computes each world; on a CPU, one thread.
     """
     world, lane = wp.tid()
     count = masses.shape[0]

@@ -1,6 +1,6 @@
-"""Multifrontal L D L^T factorization of a sparse matrix and solves with it, in vectors of four numbers, on a CPU.
+"""Multifrontal L D L^T factorization of a sparse matrix and solves with its factors, in vectors of four, on a CPU.
 
-Host code: ``egs_warp.fem.multifrontal``.
+The host code is in ``egs_warp.fem.multifrontal``.
 """
 
 import warp as wp
@@ -22,7 +22,7 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 PADDING = 16
-"""Number of entries behind the end of an array that vector loads may read; their values do not matter."""
+"""Number of entries behind the end of an array that vector loads may read. Their values have no effect."""
 
 _SIZES = f"""
     constexpr int PANEL = {PANEL};
@@ -42,11 +42,11 @@ class Fronts:
     rows: wp.array[wp.int32]
     """Permuted rows of all fronts, ascending in each."""
     in_parent: wp.array[wp.int32]
-    """For each of ``rows`` below its block: position in the parent's front."""
+    """Position of each of ``rows`` in the parent's front; only defined for rows below the block."""
     child_offsets: wp.array[wp.int32]
     """(S + 1,) offset of each block's children in ``children``."""
     children: wp.array[wp.int32]
-    """Child blocks."""
+    """Child blocks of all blocks, grouped by parent."""
     entry_offsets: wp.array[wp.int32]
     """(S + 1,) offset of each block's matrix entries in ``entries``."""
     entries: wp.array[wp.int32]
@@ -313,17 +313,17 @@ def solve_panel_native(
         inverses: inverses of the diagonal blocks of L.
         reciprocals: (n,) reciprocals of the pivots.
         right: address of B, float64.
-        row_stride: row stride of B, in numbers.
-        column_stride: column stride of B, in numbers.
+        row_stride: row stride of B, in float64 values.
+        column_stride: column stride of B, in float64 values.
         count: number of columns of B.
         weights: address of w (n,), or 0.
         dt_now: factor of B.
         dt_ahead: factor of the solution.
         projection: momentum projection.
         panel: index of the panel.
-        workspace: (panels, n + 4, ``PANEL``).
+        workspace: (panels, n + 4, ``PANEL``) scratch memory.
         solution: address of the panel's first column of the output.
-        solution_stride: row stride of the output, in numbers.
+        solution_stride: row stride of the output, in float64 values.
     """
     ...
 
@@ -402,7 +402,7 @@ def solve_vector_native(
     workspace: wp.array[real],
     solution: wp.uint64,
 ) -> None:
-    """Solve for a single right-hand side (n,); arguments as for ``solve_panel_native``, ``solution`` is contiguous."""
+    """Solve for a single right-hand side (n,); arguments as in ``solve_panel_native``, with contiguous ``solution``."""
     ...
 
 
@@ -512,9 +512,9 @@ def effort_panel_kernel(
 ) -> None:
     """Compute the quadratic model of the elastic energy (``LinearSolver.quadratic_form``).
 
-    Each panel gives the displacements X (``moves``), their ``products`` H X and the terms ``linear`` X^T g. The blocks
-    of ``quadratic`` X^T H X follow after all panels. Several launches may share the work through ``counters`` (3,):
-    next panel, next pair of panels, and number of finished panels.
+    For each panel, the displacements X (``moves``), their ``products`` H X and the linear terms X^T g (``linear``) are
+    computed. When all panels are finished, the blocks of X^T H X (``quadratic``) follow. Several launches may share the
+    work through ``counters`` (3,): next panel, next pair of panels, and number of finished panels.
     """
     panels = moves.shape[0]
     panel = claim_next(counters, 0)

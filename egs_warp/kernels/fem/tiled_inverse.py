@@ -1,8 +1,8 @@
 """Tiled inverse Cholesky factor on a GPU: thread blocks take tasks from a shared counter.
 
-Tasks are taken in order and none depends on a later one, so any number of blocks makes progress, regardless of when
-each of them starts. Every sum has a fixed order, so results do not depend on the number of blocks. Host code:
-``egs_warp.fem.tiled_cholesky``; task lists: ``egs_warp.fem.tile_tasks``.
+Tasks are taken in order and no task depends on a later one, so any number of blocks makes progress, regardless of when
+each block starts. Every sum has a fixed order, so results do not depend on the number of blocks. The host code is in
+``egs_warp.fem.tiled_cholesky``; ``egs_warp.fem.tile_tasks`` builds the task lists.
 """
 
 from enum import IntEnum
@@ -22,9 +22,9 @@ TASK_SIZE = 16
 """Length of a task record, int32.
 
 The fields are: kind, first row, number of rows, first column, number of columns, tile column whose inverse diagonal
-factor the tile is multiplied by, begin and end in ``pairs``, and slot of the tile. Then, each or -1: tile column of the
-inverse diagonal factor that the task computes, slot of the transpose of that, and slots of the partial sums with which
-its tile and the diagonal tile start.
+factor multiplies the tile, begin and end in ``pairs``, and slot of the tile. Four optional fields follow, -1 if unused:
+tile column of the inverse diagonal factor that the task computes, slot of the transpose of this inverse, slot of the
+partial sum from which the tile starts, and slot of the partial sum from which the diagonal tile starts.
 """
 
 
@@ -281,7 +281,7 @@ def tiled_inverse_kernel(
         matrix: (n, n), lower triangle, in the order of the dissection.
         tasks: (t, ``TASK_SIZE``) records of ``TileTaskGraph``.
         pairs: (p, 2) pairs of ``TileTaskGraph``.
-        order: (n,) column of ``inverse_out`` for each column of ``matrix``.
+        order: (n,) column of ``inverse_out`` that corresponds to each column of ``matrix``.
         permutation: (n,) inverse of ``order``.
         columns: number of tile columns.
         tiles: tiles of L and L^-T.

@@ -1,4 +1,4 @@
-"""Inverses of small matrices: of lower triangular ones, on a GPU by one thread block each, and of a 3 x 3 matrix."""
+"""Kernels that invert small matrices: lower triangular matrices, with one thread block each, and a 3 x 3 matrix."""
 
 import warp as wp
 
@@ -79,7 +79,8 @@ def invert_triangles_kernel(
 ):
     """Write the inverses of the diagonal blocks of ``lower``, of ``side`` <= ``MAX_ROWS`` rows, to ``inverse_out``.
 
-    Entries above the diagonal of ``inverse_out`` are unchanged. One thread block (on a CPU one thread) per block.
+    Entries above the diagonal of ``inverse_out`` are not changed. A thread block inverts each diagonal block; on a CPU,
+    one thread.
     """
     block, _lane = wp.tid()
     invert_triangle(lower, side, block, inverse_out)
@@ -93,5 +94,5 @@ def invert_momentum_matrix_kernel(
     # Out:
     inverse_out: wp.array[Mat33],
 ):
-    """Invert ``ratio`` times the angular momenta (3 x 3) of the responses to the three rigid rotations."""
+    """Invert ``ratio`` times the 3 x 3 matrix of the angular momenta of the ``rotation_response`` columns."""
     inverse_out[0] = wp.inverse(ratio * momenta[0])

@@ -1,10 +1,12 @@
 """Dual active-set method of Goldfarb and Idnani (1983), for all threads of a block on a GPU or one thread on a CPU.
 
-min 1/2 z^T z subject to l <= free + R z <= u, with rows R of length 1. The solution is z = R^T (s p), where p >= 0 are
-the multipliers of the active rows and s = +1 or -1 the sides at which they are active. On a GPU, a triangular solve
-synchronises threads once per row and a matrix product does not. So the inverse of the products of the active rows is
-stored instead of a Cholesky factor, and updated as rows are added and dropped. Rounding that accumulates in the updates
-is removed whenever the active rows are solved from scratch.
+The problem is min 1/2 z^T z subject to l <= free + R z <= u, where the rows of R have length 1. The solution is z = R^T
+(s p), where p >= 0 are the multipliers of the active rows and s = +1 or -1 the sides at which they are active.
+
+The inverse of the products of the active rows is stored instead of their Cholesky factor, and updated as rows are added
+and dropped, because on a GPU a triangular solve synchronises the threads once per row, while a matrix product does not.
+``solve_active`` solves for the active rows from scratch, which removes the rounding errors that have accumulated in the
+updates.
 """
 
 import warp as wp
@@ -30,15 +32,15 @@ OPTIMUM_FOUND, INFEASIBLE, NUMERICAL_FAILURE = wp.constant(0), wp.constant(1), w
 WRONG_SIGN_TOLERANCE = wp.constant(real(1e-9))
 """A multiplier below minus this fraction of the largest multiplier has the wrong sign."""
 REDUNDANCY_TOLERANCE = wp.constant(real(1e-12))
-"""Shift that is added to the diagonal of the products of active rows, which are singular if rows are redundant."""
+"""Shift of the diagonal of the products of active rows. The matrix is singular if rows are redundant."""
 BOUND_TOLERANCE = wp.constant(real(1e-7))
-"""Distance from its bound above which an active row counts as violated, because it depends on other active rows."""
+"""Maximum distance of an active row from its bound. A row that depends on other active rows can be further away."""
 DEPENDENCE_TOLERANCE = wp.constant(real(1e-9))
-"""A row depends on the active rows if its part orthogonal to them is below this fraction of its squared length."""
+"""A row depends on the active rows if the squared length of its part orthogonal to them is below this."""
 PIVOTS = wp.constant(600)
 """Maximum number of dual iterations."""
 _CHECK_INTERVAL = wp.constant(8)
-"""Dual iterations between two checks of the cost limit and of cancellation."""
+"""Number of dual iterations between two checks of the cost limit and of cancellation."""
 
 
 @wp.struct
@@ -56,20 +58,23 @@ class UnitConstraints:
     base_rows: wp.array2d[int]
     """(m, 3) indices of the base rows of each row of R."""
     coefficients: wp.array2d[real]
-    """(m, 3) their coefficients."""
+    """(m, 3) coefficients of these base rows."""
     base_values: wp.array[real]
-    """(k,) scratch: values of the base rows at the point that is evaluated."""
+    """(k,) scratch memory for the values of the base rows at a point."""
     values_at_origin: wp.array[real]
     """(m,) row values at z = 0."""
     lower: wp.array[real]
+    """(m,) lower bounds of the rows."""
     upper: wp.array[real]
+    """(m,) upper bounds of the rows."""
     slack: wp.array[real]
     """(m,) amount by which a row may violate its bounds."""
     cost_limit: real
-    """Cost z^T z / 2 above which the program counts as infeasible."""
+    """Cost z^T z / 2 above which the problem is treated as infeasible."""
     restarts: int
-    """Maximum number of restarts if rounding leaves a wrong row at the end. If it is not 0, the part of a row that is
-    orthogonal to the active rows is computed twice, which removes the error of the first pass."""
+    """Maximum number of restarts if rounding leaves a violated row or a multiplier of the wrong sign. If it is not 0,
+    the part of a row that is orthogonal to the active rows is orthogonalised twice, which removes the error of the
+    first pass."""
     cancelled: wp.array[int]
     """(1,) nonzero once the result is no longer needed."""
 
@@ -87,7 +92,7 @@ class ActiveSet:
     active_rows: wp.array2d[real]
     """(k, n) the active rows."""
     active_columns: wp.array2d[real]
-    """(n, k) their transpose at the last call of ``gather_active``."""
+    """(n, k) transpose of the active rows at the last call of ``gather_active``."""
     products: wp.array2d[real]
     """(k, k) inner products of the active rows."""
     root: wp.array2d[real]
@@ -101,8 +106,9 @@ class ActiveSet:
     dual_direction: wp.array[real]
     """(k,) ``inverse`` times the inner products of the entering row with the active rows."""
     scratch_a: wp.array[real]
+    """(n,) scratch memory."""
     scratch_b: wp.array[real]
-    """(n,) scratch."""
+    """(n,) scratch memory."""
     entering_row: wp.array[real]
     """(n,) entering row."""
     orthogonal_part: wp.array[real]
@@ -156,9 +162,9 @@ def gather_active(rows: UnitConstraints, state: ActiveSet, count: int, added: re
 
 @wp.func
 def solve_active(rows: UnitConstraints, state: ActiveSet):
-    """Solve for z with the rows that have a side at their bounds; return the number of active rows.
+    """Solve for z such that all rows with a side are at their bounds; return the number of these active rows.
 
-    Returns -1 if there are more active rows than unknowns or their products are not positive definite.
+    Return -1 if there are more active rows than unknowns, or if their products are not positive definite.
     """
     lane = lane_of_block()
     count = compact_indices(state.side, rows.count, rows.unknowns, state.active)
@@ -194,7 +200,7 @@ def write_inverse(state: ActiveSet, count: int):
 
 @wp.func
 def drop_wrong_sign(rows: UnitConstraints, state: ActiveSet, count: int):
-    """Deactivate rows whose multiplier has the wrong sign or whose value is off its bound; return their number."""
+    """Deactivate rows whose multiplier has the wrong sign or whose value is not at its bound; return their number."""
     lane = lane_of_block()
     most = real(0.0)
     for i in range(lane, count, wp.block_dim()):
@@ -223,7 +229,7 @@ def clear_active_set(rows: UnitConstraints, state: ActiveSet):
 
 @wp.func
 def drop_constraint(rows: UnitConstraints, state: ActiveSet, count: int, place: int):
-    """Drop the active row at index ``place`` and move the last active row there."""
+    """Drop the active row at index ``place`` of the active set, and move the last active row to this index."""
     lane = lane_of_block()
     last = count - 1
     for i in range(lane, count, wp.block_dim()):
@@ -267,7 +273,7 @@ def find_directions(rows: UnitConstraints, state: ActiveSet, count: int, directi
         state.orthogonal_part[c] = state.entering_row[c] - state.orthogonal_part[c]
     sync_block()
     if rows.restarts > 0:
-        # Once more for the part that rounding has left along the active rows.
+        # Orthogonalise again, because rounding has left a part along the active rows.
         multiply(state.active_rows, count, rows.unknowns, state.orthogonal_part, state.scratch_a)
         multiply(state.inverse, count, count, state.scratch_a, state.scratch_b)
         multiply_transposed(state.active_rows, count, rows.unknowns, state.scratch_b, state.scratch_a)
@@ -320,7 +326,7 @@ def add_constraint(rows: UnitConstraints, state: ActiveSet, active: int, row: in
         dual_step = -found[0]
         blocking = int(found[1])
         primal_step = real(wp.inf)
-        # With as many active rows as unknowns the orthogonal part is zero, up to rounding.
+        # If there are as many active rows as unknowns, the orthogonal part is zero up to rounding.
         if orthogonal_square > DEPENDENCE_TOLERANCE and count < rows.unknowns:
             primal_step = direction * (bound - state.values[row]) / orthogonal_square
         step = wp.min(primal_step, dual_step)
@@ -329,7 +335,7 @@ def add_constraint(rows: UnitConstraints, state: ActiveSet, active: int, row: in
         if not step < real(wp.inf):
             return -1
         multiplier += step
-        # All threads have read the value of the row.
+        # All threads must have read the value of the row before it is changed.
         sync_block()
         for i in range(lane, count, wp.block_dim()):
             rate = direction * real(state.side[state.active[i]]) * state.dual_direction[i]
@@ -413,8 +419,8 @@ def is_cancelled(rows: UnitConstraints):
 def dual_iterations(rows: UnitConstraints, state: ActiveSet, active: int):
     """Run the dual iterations from a dual feasible active set, adding the most violated row first.
 
-    Returns: number of active rows at the optimum; -1 if the program is infeasible or exceeds the cost limit; -2 on
-    numerical failure, cancellation, or after ``PIVOTS`` iterations.
+    Returns: number of active rows at the optimum; -1 if the problem is infeasible or exceeds the cost limit; -2 on
+    numerical failure, on cancellation, or after ``PIVOTS`` iterations.
     """
     count = int(active)
     write_inverse(state, count)
@@ -456,11 +462,11 @@ def refine(rows: UnitConstraints, state: ActiveSet, count: int):
 def find_optimum(rows: UnitConstraints, state: ActiveSet):
     """Solve from the guessed sides ``state.side``; return the status.
 
-    Guessed rows with multipliers of the wrong sign are dropped, then violated rows are added one at a time. If rounding
-    leaves a wrong row at the end, or may have made a row inconsistent with the others, the search is restarted from the
-    active rows, without the accumulated rounding, up to ``rows.restarts`` times. The mode
-    search has no restarts: no row was wrong at the end of 3,459 recorded mode regions, and restarts of the 12 failures
-    among 1,025 relaxed programs took five times as long, and four of them did not end.
+    Guessed rows with multipliers of the wrong sign are dropped, then violated rows are added one at a time. Rounding
+    may leave a violated row or a multiplier of the wrong sign at the end, or make the problem appear infeasible. In
+    these cases the search is restarted from the active rows, without the accumulated rounding errors, up to
+    ``rows.restarts`` times. The mode search uses no restarts: none was necessary in 3,459 recorded mode regions, and of
+    1,025 relaxed problems only 12 failed; restarts took five times as long for them and did not converge for four.
     """
     was_infeasible = int(0)
     for restart in range(rows.restarts + 1):

@@ -1,6 +1,6 @@
 """Dense linear algebra for all threads of a block on a GPU, or one thread on a CPU.
 
-All threads of the block call each function. After a call, what it wrote is visible to all threads.
+All threads of the block must call each function. After a call, its results are visible to all threads.
 """
 
 import warp as wp
@@ -24,10 +24,11 @@ _THREADS = """
 
 
 def by_block(body: str) -> str:
-    """Return C++ code that runs ``body`` on both kinds of device.
+    """Return C++ code that runs ``body`` on GPU and CPU.
 
-    ``body`` may use ``WAIT`` (barrier), ``lane`` (thread index) of ``lanes``, and ``own`` (index in the warp) of
-    ``WIDE`` in ``warp`` of ``warps``.
+    ``body`` may use ``WAIT`` (a barrier), ``lane`` and ``lanes`` (index and number of the threads of the block),
+    ``own`` and ``WIDE`` (index and number of the threads of the warp), and ``warp`` and ``warps`` (index and number of
+    the warps).
     """
     return f"{_THREADS}{body}\n#undef WAIT\n"
 
@@ -233,8 +234,8 @@ def compact_indices(marks: wp.array[int], count: int, capacity: int, indices: wp
 """)
 )
 def argmax_of_block(value: real, place: int) -> wp.vec2d:
-    """Return the largest of the threads' values and its index ``place``, the lowest index if several values are
-    equal."""
+    """Return the largest ``value`` of all threads and its ``place``; if several values are equal, the lowest
+    ``place``."""
     ...
 
 
@@ -302,8 +303,8 @@ def multiply_at(
     vector: wp.array[real],
     out: wp.array[real],
 ) -> None:
-    """Compute the same product for a matrix stored in ``numbers`` from index ``begin`` on, with rows ``stride`` numbers
-    apart."""
+    """Compute ``out`` = A ``vector`` as in ``multiply``, for a matrix A (rows, columns) that is stored in ``numbers``
+    from index ``begin`` on, with the row stride ``stride``."""
     ...
 
 
@@ -365,7 +366,7 @@ def multiply_at(
 def multiply_transposed(
     matrix: wp.array2d[real], rows: int, columns: int, vector: wp.array[real], out: wp.array[real]
 ) -> None:
-    """Compute ``out`` (columns,) = transpose of ``matrix`` (rows, columns) times ``vector`` (rows,)."""
+    """Compute ``out`` (columns,) = A^T ``vector``, for the ``matrix`` A (rows, columns) and the ``vector`` (rows,)."""
     ...
 
 
@@ -411,7 +412,7 @@ def normalize_rows(
 
     Args:
         parts: (rows, 3) indices of the matrix rows of each row.
-        shares: (rows, 3) their coefficients, divided by the length of the row in place.
+        shares: (rows, 3) coefficients of these matrix rows; divided by the length of the row, in place.
         lengths: (rows,) original lengths, 1 for rows of zeros.
     """
     ...
@@ -421,6 +422,6 @@ def normalize_rows(
 def apply_factor(
     root: wp.array2d[real], count: int, vector: wp.array[real], between: wp.array[real], out: wp.array[real]
 ):
-    """Compute ``out`` (count,) = U U^T ``vector``, where U is ``root``; U^T ``vector`` is left in ``between``."""
+    """Compute ``out`` (count,) = U U^T ``vector``, where U is ``root``; U^T ``vector`` is stored in ``between``."""
     multiply_transposed(root, count, count, vector, between)
     multiply(root, count, count, between, out)

@@ -1,7 +1,7 @@
 """Gaussian elimination and Cholesky factors of inverses, for all threads of a block on a GPU or one thread on a CPU.
 
-Both proceed in blocks of eight unknowns. One warp processes the diagonal block in registers; all threads apply it to
-the rest.
+Both proceed in blocks of eight unknowns. One warp processes the diagonal block in registers; all threads apply the
+result to the rest of the matrix.
 """
 
 import warp as wp
@@ -173,12 +173,12 @@ _TAKE_OFF = """
     )
 )
 def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: real) -> int:
-    """Solve a linear system in place; right-hand sides follow the unknowns' columns in each row.
+    """Solve a linear system in place. In each row, the right-hand sides follow the columns of the unknowns.
 
     Args:
-        matrix: (unknowns, columns); on return the right-hand sides hold the solution, the other columns are
-            overwritten.
-        singular: smallest admissible pivot magnitude, as a fraction of the mean of the diagonal.
+        matrix: (unknowns, columns); on return, the right-hand sides are replaced by the solutions, and the other
+            columns are overwritten.
+        singular: minimum magnitude of a pivot, as a fraction of the mean of the diagonal.
 
     Returns: 1, or 0 if a pivot on the diagonal is too small.
     """

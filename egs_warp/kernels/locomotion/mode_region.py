@@ -1,5 +1,7 @@
-"""QP of one assignment of contact modes with the activations as its only unknowns, and the rows that bound its region,
-for all threads of a block on a GPU or one thread on a CPU. See docs/concepts/locomotion.md#modes.
+"""QP for one assignment of contact modes, with the activations as its only unknowns, and the rows that bound its
+region.
+
+All threads of a block on a GPU, or one thread on a CPU, call the functions. See docs/concepts/locomotion.md#modes.
 """
 
 import math
@@ -17,30 +19,30 @@ wp.set_module_options({"enable_backward": False})
 FREE, STICK, SLIDE = 0, 1, 2
 """Contact modes."""
 TO_FREE, TO_SLIDE, TO_OTHER_DIRECTION, TO_TOUCHING = 0, 1, 2, 3
-"""Mode transitions of a contact where a row that bounds the region becomes active."""
+"""Mode transitions that a contact makes if a row that bounds the region becomes active."""
 CONE_FACES = 8
-"""Faces of the pyramid that replaces the friction cone of a sticking contact."""
+"""Number of faces of the pyramid that replaces the friction cone of a sticking contact."""
 SLIDE_SECTOR = math.radians(30.0)
-"""Largest angle, rad, between the slip of a sliding contact and the direction that its friction opposes. A fixed
-friction direction under a foot that slips elsewhere would propel the body unphysically."""
+"""Maximum angle in radians between the slip of a sliding contact and the direction that its friction opposes. If a foot
+slipped in another direction, the fixed friction direction would propel the body unphysically."""
 DELASSUS_REGULARIZATION = 1e-7
-"""Diagonal shift of the Delassus operator, relative to the mean of its diagonal: more contacts than the cage can
-resolve make it singular."""
+"""Diagonal shift of the Delassus operator, relative to the mean of its diagonal. The operator is singular if there are
+more contacts than the cage can resolve."""
 ZERO_FORCE = 1e-9
-"""Normal force, body weights, up to which a contact counts as open."""
+"""Normal force in body weights up to which a contact is treated as open."""
 CONE_FRACTION = 1.0 - 1e-6
-"""Fraction of the cone's radius from which the contact counts as sliding."""
+"""Fraction of the radius of the friction cone above which a contact is treated as sliding."""
 ZERO_SPEED = 1e-9
 """Tangential speed, in units of sqrt(g H), below which the slip has no direction."""
 MIN_MULTIPLIER = 1e-3
-"""Fraction of the objective that the multiplier of a mode constraint, in objective per unit of its row, must exceed for
-the constraint to be worth crossing."""
+"""Minimum multiplier of a mode constraint for which the search crosses the constraint, as a fraction of the objective.
+The multiplier is the decrease of the objective per unit of the row."""
 MIN_GAIN_FRACTION = 5e-3
-"""Smallest relative decrease of the objective for which the search continues in the next region."""
+"""Minimum relative decrease of the objective for which the search continues in the next region."""
 MAX_START_VIOLATION = 0.02
-"""Amount by which the start may violate a row of its region."""
+"""Maximum amount by which the start may violate a row of its region."""
 START_ROUNDING = 1e-6
-"""Amount by which rows are relaxed, for a start that is the only point of its region, for example because contacts are
+"""Amount by which rows are relaxed, because the start may be the only point of its region, for example if contacts are
 redundant."""
 
 CURRENT, NEXT, NEXT_SINGLE, WARM_START = 0, 1, 2, 3
@@ -66,7 +68,7 @@ _REGULARIZATION, _BROKEN, _ROUNDING = (
     wp.constant(real(each)) for each in (DELASSUS_REGULARIZATION, MAX_START_VIOLATION, START_ROUNDING)
 )
 _MIN_PIVOT = wp.constant(real(1e-10))
-"""Smallest admissible pivot, relative to the mean of the diagonal of the Delassus operator."""
+"""Minimum pivot, relative to the mean of the diagonal of the Delassus operator."""
 BOUND_PADDING = wp.constant(real(9e-6))
 """Amount by which bounds are relaxed, as in ``SplittingProgram``."""
 
@@ -75,9 +77,9 @@ BOUND_PADDING = wp.constant(real(9e-6))
 class Workspace:
     """Workspace for at most m activations and n contacts.
 
-    T is the number of force components of closed contacts, h the number of those whose contact velocity is zero, and v
-    the number of contact velocities that bound the region. The region has m rows of the activations and k of the
-    contact modes.
+    T is the number of force components of closed contacts, h the number of those components whose contact velocity is
+    held at zero, and v the number of contact velocities that bound the region. The region has m rows of the activations
+    and k rows of the contact modes.
     """
 
     held_index: wp.array[int]
@@ -85,28 +87,31 @@ class Workspace:
     closed_forces: wp.array[int]
     """(T,) indices of the force components of closed contacts."""
     held_forces: wp.array[int]
-    """(h,) indices of the force components whose contact velocities are zero."""
+    """(h,) indices of the force components whose contact velocities are held at zero."""
     speeds: wp.array[int]
-    """(v,) indices of the contact velocities."""
+    """(v,) indices of the contact velocities that bound the region."""
     base_rows: wp.array2d[int]
-    """(k, 3) indices, among the T forces and v velocities, of the terms of a row."""
+    """(k, 3) indices of the terms of each row among the T forces and v velocities."""
     coefficients: wp.array2d[real]
-    """(k, 3) their coefficients."""
+    """(k, 3) coefficients of these terms."""
     contact: wp.array[int]
+    """(k,) contact of each row."""
     transition: wp.array[int]
-    """(k,) contact of a row, and transition of that contact beyond the row."""
+    """(k,) transition that the contact makes beyond the row."""
     first: wp.array[int]
     """(n,) first row of each contact."""
     next: wp.array[int]
     """(k,) next row of the same contact, -1 for none."""
     equations: wp.array2d[real]
-    """(h, h + m + 1) linear system for the forces, with right-hand sides."""
+    """(h, h + m + 1) linear system for the forces, including the right-hand sides."""
     force_map: wp.array2d[real]
-    """(T + v, m + 1) forces and velocities as affine functions of the activations, the constant in the last column."""
+    """(T + v, m + 1) forces and velocities as affine functions of the activations, with the constant in the last
+    column.
+    """
     cost_rows: wp.array2d[real]
-    """(m + T, T) columns of the cost matrix; scratch of ``write_speeds``."""
+    """(m + T, T) columns of the cost matrix; also scratch memory of ``write_speeds``."""
     cost_products: wp.array2d[real]
-    """(m + T, m + 1) cost matrix times the affine map; scratch of ``write_speeds``."""
+    """(m + T, m + 1) cost matrix times the affine map; also scratch memory of ``write_speeds``."""
     cost: wp.array2d[real]
     """(m, m) Hessian of the cost of the activations."""
     root: wp.array2d[real]
@@ -116,24 +121,28 @@ class Workspace:
     minimum: wp.array[real]
     """(m,) activations of the unconstrained minimum."""
     optimum: wp.array[real]
-    """(m,) optimum."""
+    """(m,) activations of the optimum."""
     at_minimum: wp.array[real]
+    """(T + v,) forces and velocities at ``minimum``, without the constant."""
     at_start: wp.array[real]
+    """(T + v,) forces and velocities at ``start``, without the constant."""
     at_optimum: wp.array[real]
-    """(T + v,) forces and velocities at the minimum, the start and the optimum, without the constant."""
+    """(T + v,) forces and velocities at ``optimum``, without the constant."""
     lengths: wp.array[real]
     """(m + k,) lengths of the rows before scaling."""
     bounds: wp.array2d[real]
     """(2, m + k) lower and upper bounds before scaling."""
     values: wp.array[real]
-    """(m + 3n,) scratch: products of the QP's matrices with ``trial``."""
+    """(m + 3n,) scratch memory for products of the QP's matrices with ``trial``."""
     multipliers: wp.array[real]
-    """(k,) multipliers of the rows of the modes."""
+    """(k,) multipliers of the rows of the contact modes."""
     kinds: wp.array2d[int]
-    """(4, n) modes of the region being solved, of the region beyond all its active bounds, of the region beyond its
-    strongest active bound only, and the last of these for the best region so far."""
+    """(4, n) contact modes in four slots: ``CURRENT``, the region being solved; ``NEXT``, the region beyond all its
+    active bounds; ``NEXT_SINGLE``, the region beyond its strongest active bound only; ``WARM_START``, the slot
+    ``NEXT_SINGLE`` of the best region so far.
+    """
     slips: wp.array3d[real]
-    """(4, n, 2) slip directions."""
+    """(4, n, 2) slip directions in the same slots."""
     start: wp.array[real]
     """(m,) activations from which the region is entered."""
     trial: wp.array[real]
@@ -142,21 +151,32 @@ class Workspace:
 
 @wp.struct
 class Program:
-    """Packed QP and the offset of each of its parts."""
+    """Packed QP (``CoulombProgram``) and the offset of each of its parts in ``packed``."""
 
     packed: wp.array[real]
+    """Packed QP, in the layout that ``mode_search_kernel`` documents."""
     m: int
+    """Number of activations."""
     n: int
+    """Number of contacts."""
     size: int
     """m + 3n."""
     friction: real
+    """Coulomb coefficient mu."""
     constant: real
+    """Constant of the objective."""
     cost: int
+    """Offset of P (m + 3n, m + 3n)."""
     slope: int
+    """Offset of q (m + 3n,)."""
     rows: int
+    """Offset of the rows (3n, m + 3n) of the contact velocities."""
     offset: int
+    """Offset of the constants (3n,) of the contact velocities."""
     lower: int
+    """Offset of the lower bounds (m,) of the activations."""
     upper: int
+    """Offset of the upper bounds (m,) of the activations."""
 
 
 @wp.func
@@ -249,7 +269,9 @@ def list_contact_rows(program: Program, workspace: Workspace, sticks: int, slide
 def solve_force_map(program: Program, workspace: Workspace, closed_count: int, held_count: int):
     """Compute the forces that keep the held contact velocities at zero, as affine functions of the activations.
 
-    Returns: 1, or 0 if a pivot is too small; rows are not exchanged.
+    Rows are not exchanged.
+
+    Returns: 1, or 0 if a pivot is too small.
     """
     lane = lane_of_block()
     m = program.m
@@ -403,7 +425,7 @@ def write_rows(
     """Write the rows in whitened coordinates, scaled to length 1, and their bounds.
 
     Args:
-        initial_values: (m + mode_rows,) written: row values at the start relative to the minimum.
+        initial_values: (m + mode_rows,) output: row values at the start minus row values at the minimum.
         map_rows: number of rows of ``force_map``.
         mode_rows: number of rows of the contact modes.
     """

@@ -1,6 +1,6 @@
-"""Search over contact modes in a single launch: one thread block on a GPU, one thread on a CPU.
+"""Search over contact modes in a single launch, with one thread block on a GPU or one thread on a CPU.
 
-The host version is ``contact_modes.search_modes``. See docs/concepts/locomotion.md.
+``contact_modes.search_modes`` is the search on the host. See docs/concepts/locomotion.md.
 """
 
 import warp as wp
@@ -62,8 +62,8 @@ _CURRENT, _NEXT = wp.constant(CURRENT), wp.constant(NEXT)
 _NEXT_SINGLE, _WARM_START = wp.constant(NEXT_SINGLE), wp.constant(WARM_START)
 _HEADER = wp.constant(HEADER_SIZE)
 INFEASIBLE_COST = wp.constant(real(1e6))
-"""Cost above which a QP counts as infeasible, relative to the decrease of the objective from the origin to the
-unconstrained minimum; as on the host."""
+"""Cost above which a QP is treated as infeasible, relative to the decrease of the objective from the origin to the
+unconstrained minimum. The host uses the same value."""
 _ACTIVE, _GAIN, _ZERO_SPEED = (wp.constant(real(each)) for each in (MIN_MULTIPLIER, MIN_GAIN_FRACTION, ZERO_SPEED))
 
 
@@ -87,7 +87,7 @@ def crash_start(rows: UnitConstraints, state: ActiveSet):
 
 @wp.func
 def count_violations(program: Program, workspace: Workspace, map_rows: int, mode_rows: int):
-    """Return the number of rows that ``optimum`` violates."""
+    """Return the number of rows that ``workspace.optimum`` violates."""
     m = program.m
     multiply(workspace.force_map, map_rows, m, workspace.optimum, workspace.at_optimum)
     violations = real(0.0)
@@ -107,7 +107,8 @@ def count_violations(program: Program, workspace: Workspace, map_rows: int, mode
 
 @wp.func
 def scatter_optimum(program: Program, workspace: Workspace, closed_count: int):
-    """Write the optimum, clamped to its bounds, and the contact response to ``trial``; return the objective."""
+    """Write the optimal activations, clamped to their bounds, and the contact forces for them to ``trial``; return the
+    objective."""
     lane = lane_of_block()
     m = program.m
     for k in range(lane, program.size, wp.block_dim()):
@@ -166,8 +167,8 @@ def apply_transition(program: Program, workspace: Workspace, contact: int, trans
 def find_next_modes(
     program: Program, workspace: Workspace, state: ActiveSet, active_count: int, mode_rows: int, objective: real
 ):
-    """Write two candidates for the next modes: those beyond all bounds with a significant multiplier, and those beyond
-    the strongest of these bounds only.
+    """Write two candidates for the next modes: the modes beyond all bounds with a significant multiplier, and the modes
+    beyond the strongest of these bounds only.
 
     Returns: number of bounds with a significant multiplier.
     """
@@ -204,7 +205,7 @@ def find_next_modes(
     count = sum_of_block(count)
     strongest_row = argmax_of_block(max_multiplier, place)
     for i in range(lane, program.n, wp.block_dim()):
-        # The row with the largest multiplier decides.
+        # The row with the largest multiplier determines the transition of the contact.
         strongest = min_multiplier
         last = int(-1)
         row = workspace.first[i]
@@ -227,7 +228,9 @@ class ModeRegionResult:
     """Result of ``solve_mode_region``."""
 
     ended: int
+    """Status of the solve, ``OPTIMUM_FOUND``, ``INFEASIBLE`` or ``NUMERICAL_FAILURE``."""
     objective: real
+    """Objective at the optimum."""
     active_count: int
     """Number of active bounds of the region with a significant multiplier."""
 
@@ -313,7 +316,7 @@ def copy_modes(workspace: Workspace, n: int, source: int, target: int):
 
 @wp.func
 def unpack_program(packed: wp.array[real]):
-    """Return the parts of the packed input according to its header."""
+    """Return the ``Program`` of a packed input, with the offsets that follow from its header."""
     program = Program()
     program.packed = packed
     program.m = int(packed[0])
@@ -347,14 +350,14 @@ def mode_search_kernel(
     """Run ``contact_modes.search_modes`` on packed input.
 
     Args:
-        packed: m, n, friction, the constant, the maximum number of QPs, padding up to ``HEADER_SIZE``; P, q, rows,
-            offset, bounds of the activations; at the start the activations (m,), mode of each contact (n,), and slip
-            directions (n, 2).
+        packed: m, n, friction, constant, maximum number of QPs, and padding up to ``HEADER_SIZE``; then P, q, rows,
+            offset, lower and upper bounds of the activations; then the activations (m,), contact modes (n,) and slip
+            directions (n, 2) at the start of the search.
         restart_cost: objective below which no restart is needed.
-        workspace, rows, state, splitting: scratch.
-        answer: status, number of QPs, number of infeasible QPs, objective, 1 if there is a point; from ``HEADER_SIZE``
-            on the point (m + 3n,).
-        settled_out: (1,) set to 1 once a point with objective below ``restart_cost`` is found.
+        workspace, rows, state, splitting: scratch memory.
+        answer: status, number of QPs, number of infeasible QPs, objective, 1 if a point was found; from ``HEADER_SIZE``
+            on, the point (m + 3n,).
+        settled_out: (1,) set to 1 once a point with an objective below ``restart_cost`` is found.
     """
     lane = lane_of_block()
     program = unpack_program(packed)
@@ -392,13 +395,14 @@ def mode_search_kernel(
         elif solved.ended == INFEASIBLE:
             infeasible += 1
             if has_point == 0 and infeasible == 1 and sliding > real(0.0):
-                # The start's slipping contacts were first tried as sticking; retry with its modes unchanged.
+                # The search began with sliding contacts set to stick. Retry with the unchanged modes of the start.
                 for i in range(lane, n, wp.block_dim()):
                     workspace.kinds[_CURRENT, i] = int(packed[begin + m + i])
                 sync_block()
                 continues = 1
         elif has_point == 1 and solved.objective >= best:
-            # All transitions together raised the objective; the one with the largest multiplier may still lower it.
+            # All transitions together raised the objective. The transition with the largest multiplier alone may still
+            # lower it.
             if has_several == 1 and is_single == 0:
                 copy_modes(workspace, n, _WARM_START, _CURRENT)
                 is_single = 1

@@ -1,6 +1,6 @@
-"""Kernel of the active-set method for one dense QP on a CPU, with the functions of the mode search on a GPU.
+"""Kernel of the active-set method for one dense QP on a CPU. It calls the functions that the mode search uses on a GPU.
 
-Host code: ``egs_warp/locomotion/active_set.py``.
+The host code is in ``egs_warp/locomotion/active_set.py``.
 """
 
 import warp as wp
@@ -28,7 +28,7 @@ def optimum_kernel(
 ):
     """Find the optimum ``state.z`` from the guessed sides ``state.side`` of ``count`` rows (see ``find_optimum``).
 
-    Writes the status and the number of active rows to ``ended`` (2,).
+    The status and the number of active rows are written to ``ended`` (2,).
     """
     rows.unknowns = unknowns
     rows.count = count

@@ -1,6 +1,6 @@
-"""Optimum of a step's QP without complementarity: one thread block on a GPU, one thread on a CPU.
+"""Optimum of a step's QP without complementarity, with one thread block on a GPU or one thread on a CPU.
 
-The host version is ``contact_modes.solve_relaxed``. See docs/concepts/locomotion.md.
+``contact_modes.solve_relaxed`` is the solve on the host. See docs/concepts/locomotion.md.
 """
 
 import warp as wp
@@ -45,10 +45,10 @@ _REGULARIZATION = wp.constant(real(DELASSUS_REGULARIZATION))
 
 @wp.struct
 class Relaxed:
-    """Scratch for at most N = m + 3n unknowns: m activations and the forces of n contacts.
+    """Scratch memory for at most N = m + 3n unknowns: m activations and the forces of n contacts.
 
-    The k = m + 10n rows are the n normal contact velocities, the m activations, then the components of the forces in
-    their cones.
+    There are k = m + 10n rows: the n normal contact velocities, the m activations, and nine cone components of each
+    contact force (``cone_component``).
     """
 
     cost: wp.array2d[real]
@@ -58,10 +58,13 @@ class Relaxed:
     leaving: wp.array2d[real]
     """(n, N) rows of the normal contact velocities."""
     minimum: wp.array[real]
+    """(N,) unconstrained minimum."""
     optimum: wp.array[real]
+    """(N,) optimum."""
     slope: wp.array[real]
+    """(N,) linear term of the objective."""
     values: wp.array[real]
-    """(N,) unconstrained minimum, optimum, gradient, scratch."""
+    """(N,) scratch memory."""
     speeds: wp.array[real]
     """(n,) normal contact velocities."""
     lengths: wp.array[real]
@@ -72,8 +75,9 @@ class Relaxed:
 
 @wp.func
 def cone_component(friction: real, part: int):
-    """Return the coefficients of a nonnegative component of a force: the normal force for ``part`` 0, and otherwise the
-    distance to a face of the friction pyramid."""
+    """Return the coefficients of a force component that must not be negative: for ``part`` 0 the normal force,
+    otherwise the distance to a face of the friction pyramid.
+    """
     if part == 0:
         return wp.vec3d(real(1.0), real(0.0), real(0.0))
     return wp.vec3d(friction, -COSINES[part - 1], -SINES[part - 1])
@@ -81,7 +85,7 @@ def cone_component(friction: real, part: int):
 
 @wp.func
 def diagonal_shift(program: Program):
-    """Return the regularization of the diagonal of the cost."""
+    """Return the regularization that is added to the diagonal of the cost."""
     mean = real(0.0)
     for i in range(lane_of_block(), program.size, wp.block_dim()):
         mean += program.packed[program.cost + i * (program.size + 1)] / real(program.size)
@@ -231,8 +235,8 @@ def relaxed_qp_kernel(
 
     Args:
         packed: packed input of ``mode_search_kernel``.
-        relaxed, rows, state, splitting: scratch.
-        answer: status and objective; from ``HEADER_SIZE`` on the activations (m,).
+        relaxed, rows, state, splitting: scratch memory.
+        answer: status and objective; from ``HEADER_SIZE`` on, the activations (m,).
     """
     lane = lane_of_block()
     program = unpack_program(packed)
@@ -284,8 +288,8 @@ def pack_search_kernel(
 
     Args:
         weight: body weight, N.
-        activations: (m,) new start.
-        forces: (K,) N, contact response to them.
+        activations: (m,) activations at the new start.
+        forces: (K,) N, contact forces for these activations.
         is_settled: (1,) nonzero to set the maximum number of QPs to 0.
         packed_out: packed input of ``mode_search_kernel``.
     """

@@ -1,8 +1,8 @@
 """OSQP iterations that guess the active set of an optimum, for all threads of a block (Stellato, Banjac, Goulart,
 Bemporad and Boyd 2020).
 
-The Hessian is the identity, so each step changes z by a linear combination of the k selected rows of R. The iterations
-therefore update only its coefficients: z = ``share`` z_0 + R^T ``sums``.
+The Hessian is the identity, so each iteration changes z by a linear combination of the k selected rows of R. Therefore
+only coefficients are updated: z = ``share`` z_0 + R^T ``sums``.
 """
 
 import warp as wp
@@ -25,7 +25,7 @@ _RHO = wp.constant(real(1.0))
 """Number of iterations and rho, both as in ``egs_warp/locomotion/operator_splitting.py``."""
 _SIGMA = wp.constant(real(1e-6))
 _ALPHA = wp.constant(real(1.6))
-"""sigma, and alpha, the over-relaxation factor: OSQP's defaults."""
+"""sigma and the over-relaxation factor alpha, with the default values of OSQP."""
 
 
 @wp.struct
@@ -41,9 +41,11 @@ class Splitting:
     sums: wp.array[real]
     """(k,) coefficients of the rows in z."""
     right: wp.array[real]
+    """(k,) scratch memory: right-hand side of an iteration."""
     between: wp.array[real]
+    """(k,) scratch memory of ``apply_factor``."""
     step: wp.array[real]
-    """(k,) scratch."""
+    """(k,) scratch memory: solution of an iteration."""
     initial_values: wp.array[real]
     """(m,) R z_0 of all rows."""
     all_multipliers: wp.array[real]
@@ -54,8 +56,8 @@ class Splitting:
 def iterate(rows: UnitConstraints, state: ActiveSet, splitting: Splitting):
     """Replace the guess ``state.side`` by the active set after a fixed number of OSQP iterations.
 
-    The iterations consider only rows with a side. If those outnumber the unknowns or cannot be factorized, the guess is
-    unchanged.
+    The iterations consider only rows with a side. If there are more of them than unknowns, or if their products cannot
+    be factorized, the guess stays unchanged.
     """
     lane = lane_of_block()
     one = real(1.0)
@@ -71,7 +73,7 @@ def iterate(rows: UnitConstraints, state: ActiveSet, splitting: Splitting):
         splitting.multipliers[i] = real(0.0)
         splitting.sums[i] = real(0.0)
     share = real(1.0)
-    # Not a range loop, which Warp would unroll.
+    # Warp would unroll a range loop.
     iteration = int(0)
     while iteration < _ITERATIONS:
         iteration += 1

@@ -1,6 +1,6 @@
-"""Pack the QP of a step for ``mode_search_kernel``, and unpack its result, on the device.
+"""Kernels that pack the QP of a step for ``mode_search_kernel`` and unpack its result, on the device.
 
-Host code: ``egs_warp/locomotion/device_plan.py``. The packed layout is the one that ``mode_search_kernel`` documents.
+The host code is in ``egs_warp/locomotion/device_plan.py``. ``mode_search_kernel`` documents the packed layout.
 """
 
 import warp as wp
@@ -22,9 +22,12 @@ def assemble_contact(packed: wp.array[real], kinds: int, slips: int, i: int, for
     """Write the mode and slip direction of contact ``i`` under its ``force``, which satisfies Coulomb's law.
 
     Args:
-        packed: packed search input, written at the offsets ``kinds`` and ``slips``.
-        force: normal and tangential force, body weights.
-        friction: friction coefficient.
+        packed: packed search input.
+        kinds: offset of the modes in ``packed``.
+        slips: offset of the slip directions in ``packed``.
+        i: the contact.
+        force: normal and two tangential components, body weights.
+        friction: Coulomb coefficient.
     """
     tangential = wp.sqrt(force[1] * force[1] + force[2] * force[2])
     kind = _FREE
@@ -63,13 +66,13 @@ def assemble_qp_kernel(
         limit: maximum number of QPs that the search may solve.
         speed: sqrt(g H), m/s, the unit of velocity.
         weight: body weight, N, the unit of force.
-        counts: (1,) n.
-        frictions: (1,) friction coefficient.
+        counts: (1,) number of contacts n.
+        frictions: (1,) Coulomb coefficient.
         form: (m + 3K + 1, m + 3K + 1) quadratic form of the cost.
         speeds: (3K, m + 3K + 1) m/s, contact velocities as affine functions.
         shifts: (K,) m/s, normal bias of each contact.
-        bounds: (3, m) lower and upper bounds of the activations, and their start.
-        forces: (K,) N, contact response to the start.
+        bounds: (3, m) lower bounds, upper bounds and start of the activations.
+        forces: (K,) N, contact forces at the start.
         packed_out: packed search input.
     """
     row, column = wp.tid()
@@ -120,12 +123,13 @@ def scatter_solution_kernel(
     # Out:
     x_out: wp.array[real],
 ):
-    """Expand the point of the search result to capacity.
+    """Expand the point of the search result to the contact capacity K.
 
     Args:
+        counts: (1,) number of contacts n.
         answer: packed search result.
         m: number of activations.
-        x_out: (m + 3K + 1,) the point, zero for unused contacts, 1 in the last entry.
+        x_out: (m + 3K + 1,) the point, with zeros for unused contacts and 1 as the last entry.
     """
     k = wp.tid()
     size = m + 3 * counts[0]
@@ -149,8 +153,8 @@ def accept_search_kernel(
 ):
     """Write 1 to ``settled_out`` if no restart is needed after the search, and otherwise 0.
 
-    No restart is needed if the result is a point whose objective is below ``restart_cost``, or any point of a step
-    without contacts, which has no other region.
+    No restart is needed if the search found a point and its objective is below ``restart_cost``, or if the step has no
+    contacts, so that there is no other region.
     """
     settled = int(0)
     if answer[0] == real(_OPTIMUM_FOUND) and answer[4] == real(1.0) and (counts[0] == 0 or answer[3] < restart_cost):
