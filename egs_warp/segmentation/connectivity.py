@@ -15,9 +15,9 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.unique_rows import distinct_rows
 
 _ARM = 1.5
-"""Length of a Gaussian's arms in standard deviations; arms are limited to four cells."""
+"""Half-length of a Gaussian along each axis, in standard deviations; limited to four cells."""
 _FOURTH = 4
-"""Index of the neighbour whose distance measures how sparse a capture is."""
+"""Rank of the nearest neighbour whose distance measures how sparse a capture is."""
 _MAX_GAUSSIANS = 200_000
 """Maximum number of Gaussians, spread evenly, from which the sparsity is measured."""
 
@@ -27,7 +27,7 @@ def connected_parts(
 ) -> np.ndarray:
     """(m,) int32 connected part of each of the ``chosen`` (m,) Gaussians.
 
-    Gaussians are connected if their centres or arms lie in the same cell of a grid.
+    Gaussians are connected if points on their axes, the mean included, lie in the same cell of a grid.
 
     Args:
         cloud: the capture.

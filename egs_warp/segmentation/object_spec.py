@@ -36,9 +36,9 @@ class ObjectSpec:
     point: np.ndarray | None = None
     """(3,) on or in the object, scene units."""
     clicks: tuple[Click, ...] = ()
-    """Clicks; each adds the Gaussians that it hits and those connected to them, or removes them."""
+    """Clicks, each of which adds the Gaussians that it hits and their connected parts, or removes them."""
     picked: np.ndarray | None = None
-    """(n,) bool, the Gaussians of the object as the user has picked them; nothing is searched for."""
+    """(n,) bool, the object's Gaussians as the user has picked them; no search takes place."""
 
     @classmethod
     def of_clicks(cls, clicks: Sequence[Click]) -> ObjectSpec:
@@ -55,7 +55,7 @@ class Segmentation:
     """The object among the Gaussians of a capture."""
 
     object_mask: np.ndarray
-    """(n,) bool, the object; its means lie above the plane."""
+    """(n,) bool, the object's Gaussians, whose means lie above the plane."""
     buried_mask: np.ndarray
     """(n,) bool, Gaussians under the object's foot or claimed as its parts, with means near or below the plane, mostly
     hidden. They belong to neither object nor background."""

@@ -1,4 +1,4 @@
-"""Votes of masks for each Gaussian: its blending weight inside and outside a mask, summed over pixels.
+"""Votes of masks for each Gaussian: its blending weight inside and outside the masks, summed over pixels.
 
 See docs/concepts/segmentation.md.
 """
