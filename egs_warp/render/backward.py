@@ -1,4 +1,4 @@
-"""Backward pass of the renderer: from gradients of the pixels to those of the Gaussians and the camera pose."""
+"""Backward pass of the renderer: gradients with respect to the Gaussians and the camera pose, from pixel gradients."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class CloudGradients:
     screen: wp.array | None
     """(n,) vec2, with respect to the screen position in pixels; None if not requested."""
     pose_rotation: wp.array | None
-    """(n,) mat33, each Gaussian's part of the gradient with respect to the camera's rotation matrix; None if not
-    requested."""
+    """(n,) mat33, contribution of each Gaussian to the gradient with respect to the camera's rotation matrix; None if
+    not requested."""
     pose_translation: wp.array | None
     """(n,) vec3, likewise for the translation."""
 

@@ -1,4 +1,4 @@
-"""Compositing: tile lists to pixels."""
+"""Compositing of the tile lists into pixels."""
 
 from __future__ import annotations
 
