@@ -27,7 +27,7 @@ MAX_FRICTION = 2.0
 STYLE_NAMES = tuple(field.name for field in fields(Style) if field.name != "overlap")
 """Names of the style factors; a session keeps the overlap of its body."""
 _MOTIONS = re.compile(r"[A-Za-z0-9_=+\-., ]+")
-"""Characters allowed in the text of motions."""
+"""Pattern of the text of motions: its allowed characters."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class PushOnce:
 
 @dataclass(frozen=True)
 class Change:
-    """Change friction or stiffness; None leaves a value unchanged."""
+    """Change friction or stiffness; None leaves a property unchanged."""
 
     friction: float | None = None
     """Coulomb coefficient."""
@@ -91,7 +91,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Restyle:
-    """Set the style of jumps from the next motion on."""
+    """Set the style of all later jumps."""
 
     style: Style
     """The factors."""
@@ -177,7 +177,7 @@ def _read_script(message: Mapping[str, Any], max_distance: float, node_count: in
     text = message.get("text")
     if not isinstance(text, str) or len(text) > MAX_TEXT_LENGTH:
         raise ValueError(f"text: give motions in at most {MAX_TEXT_LENGTH} characters, such as jump 0.5 0.2")
-    # Scripts and key frames are files of this machine, which a page must not read.
+    # Scripts and key frames would be files of this machine, which a page must not read.
     if not _MOTIONS.fullmatch(text) or re.search(r"\.(json|csv)", text, re.IGNORECASE):
         raise ValueError("text: give motions by name and number, such as hop x3, twist 90")
     script = motion(text)

@@ -1,7 +1,7 @@
 """Split the Gaussians of a live creature before it moves.
 
-The motion is not known in advance. The Gaussians are split for deformations along the softest modes of the body, which
-bend most in any motion.
+Because the motion is not known in advance, the Gaussians are split for deformations along the softest modes of the
+body, which any motion excites most.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MODE_AMPLITUDE = 0.3
 
 
 def presplit_gaussians(creature: Creature) -> GaussianCloud:
-    """Return the Gaussians of the creature at rest; those that the softest modes bend are split."""
+    """Return the Gaussians of the creature at rest, split where the softest modes bend them."""
     embedding = embed_gaussians(creature.cloud, creature.cage.mesh)
     return split_for_motion(creature.cloud, embedding, likely_poses(creature.body)).cloud
 

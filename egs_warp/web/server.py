@@ -1,6 +1,6 @@
-"""Local server of the page, its runs, and a socket that sends frames of a live session.
+"""Local server of the page, of its runs, and of a socket that sends frames of a live session.
 
-Only programs on this machine can connect, and only pages that this server has sent.
+Only programs on this machine can connect, and only pages from this server may use the socket.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class PageServer:
 
     @property
     def address(self) -> str:
-        """Address of the page; everyone who knows it can see the run."""
+        """Address of the page. It contains a secret, so only users who know the address can see the run."""
         query = "?live" if self._feed is not None else f"?runs={len(self._runs)}" if len(self._runs) > 1 else ""
         return f"http://{HOST}:{self.port}/{self.token}/{query}"
 
@@ -192,7 +192,7 @@ async def _receive_messages(page: WebSocket, feed: FrameFeed) -> None:
                 raise ValueError("not an object")
             feed.receive(message)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            # Answer in one line and continue.
+            # Report the error in one line and continue.
             await page.send_text(json.dumps({"error": f"invalid message: {str(error)[:200]}"}))
 
 

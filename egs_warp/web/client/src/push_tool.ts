@@ -44,7 +44,8 @@ export class PushTool {
     this.viewer.invalidate();
   }
 
-  /** Return the camera's horizontal viewing direction; from straight above, the up direction of the image. */
+  /** Return the horizontal viewing direction of the camera or, if it looks straight down, the up direction of the
+   * image. */
   private pushDirection(): THREE.Vector3 {
     const { camera } = this.viewer;
     const flat = (direction: THREE.Vector3): THREE.Vector3 => direction.setZ(0);
