@@ -25,8 +25,8 @@ threshold loses 0.01 to 0.02 dB, and more if smaller fit errors are split."""
 
 MIN_FIT_ERROR = 7e-4
 """Minimum fit error at which a Gaussian is split, relative to the cage's diagonal. A smaller value would represent
-motions more accurately (benchmarks/table1.py), but would split so many Gaussians of a fuzzy capture that its image at
-rest would fall below 45 dB."""
+motions more accurately (benchmarks/table1.py), but the additional splits would lower a fuzzy capture's image at rest to
+below 45 dB."""
 
 
 class SplitRule(Enum):

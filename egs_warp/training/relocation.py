@@ -41,7 +41,7 @@ initial rate."""
 
 class Population:
     """Parameter tensors and one Adam optimiser for all of them. ``relocate`` replaces tensors, so callers must read
-    ``tensors`` anew in each step."""
+    ``tensors`` again in each step."""
 
     def __init__(
         self,
