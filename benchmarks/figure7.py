@@ -5,11 +5,12 @@ It belongs to the object if more than half of its blending weight lies in the ob
 not used. The other methods are those of Table 3: Gaussians that straddle the plane are removed (``remove``), cut at the
 plane (``static split``), or trained until they are clear of it (``L_seg``).
 
-The measure is that of Table 3, with cameras in the plane: the residual is the sum of the pixels below the plane
+The measure is the same as in Table 3, with cameras in the plane: the residual is the sum of the pixels below the plane
 divided by the sum above it; PSNR and SSIM compare the upper half with the hard assignment, which contains everything
 that the masks show. Aim: ``figure7_best``: in every scene L_seg has a residual of at most 0.002, as in the paper, and
-no other method with so small a residual has a higher PSNR of the upper half. ``whole dB``, which has no aim, combines
-both: the PSNR of the whole image, whose target is the hard assignment's upper half above an empty lower half.
+no other method with a residual of at most 0.002 has a higher PSNR of the upper half. ``whole dB``, which has no aim,
+combines both: it is the PSNR of the whole image, whose target is the hard assignment's upper half above an empty lower
+half.
 
 The image (``--plot``) has one row for each scene, seen from just above the plane at the object's foot: the whole
 scene, then the four methods.

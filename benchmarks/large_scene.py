@@ -1,7 +1,7 @@
 """Memory and time of each stage from capture to film, for a scene of millions of Gaussians.
 
 A real capture (``--scene``) is repeated side by side along its plane until there are ``--gaussians`` Gaussians, with
-colours of degree 3, the highest degree of a capture. The object is the one of the original copy, clicked as in
+colours of degree 3, the highest degree of a capture. The object belongs to the original copy and is clicked as in
 ``scene_quality.py``. Stages: ``load`` reads the scene from a file, ``plane`` finds the support plane, ``ground``
 measures the ground, ``object`` segments the object, ``hole`` inpaints the floor, ``body`` builds the creature,
 ``animate`` simulates ``--frames`` frames of a jump, ``film`` renders them in the scene. ``peak`` is the peak resident

@@ -51,7 +51,7 @@ def cuda_rows(
     points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats: int, table: Table, others: Sequence[str]
 ) -> list[Row]:
     """Return one row per cell: times of the forward pass alone, and with the backward pass, for our renderer and for
-    those of the renderers ``others`` that are installed."""
+    the installed renderers among ``others``."""
     renderers: dict[str, peers.Renderer] = {"ours": peers.ours}
     for name in others:
         try:

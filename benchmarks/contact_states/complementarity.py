@@ -169,7 +169,7 @@ def proposed_pivots(
         states: (n,) current states.
         x: (pairs,) left sides of Eq. (9), from ``PyramidProgram.pairs``.
         w: (pairs,) right sides of Eq. (9), from ``PyramidProgram.pairs``.
-        multipliers: (rows,) multipliers of all rows; only those of rows fixed to zero are used.
+        multipliers: (rows,) multipliers of all rows; only the multipliers of rows fixed to zero are used.
         zero: values of x, w and the multipliers that are not larger than this are treated as zero.
     """
     point, multiplier = Pairs.of(layout, x, w), _multipliers(layout, multipliers)
@@ -251,7 +251,7 @@ def plain_pivots(
 ) -> list[Pivot]:
     """Propose changes of state like the pivots of a QPCC, as the baseline: each multiplier is judged alone.
 
-    The arguments are those of ``proposed_pivots``.
+    The arguments are the same as for ``proposed_pivots``.
 
     A contact whose free side is zero changes to the state in which the row of the multiplier is free: static to
     separate or slide k, slide k to static, separate or slide j, separate to static.

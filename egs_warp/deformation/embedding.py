@@ -32,7 +32,7 @@ class PointEmbedding:
     nodes: wp.array
     """(P,) vec4i, node indices of its corners."""
     weights: wp.array
-    """(P,) vec4d, barycentric weights of sum 1; negative ones extrapolate."""
+    """(P,) vec4d, barycentric weights with sum 1; negative weights extrapolate."""
     inside: wp.array
     """(P,) bool, True if a tetrahedron contains the point."""
 

@@ -75,8 +75,8 @@ class RimColours:
         return found[rows, columns]
 
     def offsets_for(self, uncovered: np.ndarray, is_source: np.ndarray) -> list[np.ndarray]:
-        """Return offsets (2,) int under which the ``uncovered`` (n,) bool pixels get common colours from ``is_source``
-        (H, W), in pieces as large as possible."""
+        """Return offsets (2,) int under which the sources in ``is_source`` (H, W) give the ``uncovered`` (n,) bool
+        pixels common colours. Each offset covers as many pixels as possible."""
         uncovered, found = uncovered.copy(), []
         while uncovered.any() and len(found) < _MAX_ADDED:
             at, common = self._domain[uncovered], self._common[uncovered]

@@ -39,8 +39,8 @@ _MIN_BRIGHTNESS = 0.02
 _EVERY = 3
 """Sampling step in texels."""
 _ROUNDS = 4
-"""Maximum number of rounds. The floor that gives the prediction may itself be stained, until an earlier round has added
-that stain to the hole."""
+"""Maximum number of rounds. The floor from which brightness is predicted may itself be stained, until an earlier round
+has added that stain to the hole."""
 _FEW = 20
 """Texels. The search ends when a round adds fewer."""
 _REACH = 60.0
@@ -53,9 +53,9 @@ def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.
     """(rows, columns) bool, the stained part of the floor.
 
     A stain is connected to the hole and, in at least one channel, darker than predicted from the floor farther out. The
-    half of the floor that is farther from the hole gives the prediction and is never stained. Regions that extend from
-    the hole by more than half of its side are not stains, and the result is empty if the stain exceeds twice the hole's
-    area.
+    prediction uses the half of the floor that is farther from the hole; this half is never stained. Regions that extend
+    from the hole by more than half of its side are not stains, and the result is empty if the stain exceeds twice the
+    hole's area.
 
     Args:
         hole: (rows, columns) bool.

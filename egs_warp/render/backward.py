@@ -38,7 +38,8 @@ class CloudGradients:
     """(n,) mat33, contribution of each Gaussian to the gradient with respect to the camera's rotation matrix; None if
     not requested."""
     pose_translation: wp.array | None
-    """(n,) vec3, likewise for the translation."""
+    """(n,) vec3, contribution of each Gaussian to the gradient with respect to the camera's translation; None if not
+    requested."""
 
 
 def backward(
@@ -62,7 +63,8 @@ def backward(
     Args:
         cloud, view, projected, lists, image: inputs and results of the forward pass.
         colour_gradient: (H, W) vec3, gradient with respect to ``image``'s colour; None for zero.
-        alpha_gradient, depth_gradient: (H, W) float32, likewise.
+        alpha_gradient, depth_gradient: (H, W) float32, gradients with respect to ``image``'s alpha and depth; None for
+            zero.
         antialiased: as in the forward pass.
         want_pose: also compute the gradient with respect to the camera pose.
         want_screen: also compute the gradient with respect to the screen positions.

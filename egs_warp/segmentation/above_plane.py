@@ -77,8 +77,8 @@ class SceneAbovePlane:
 def detached_parts(
     scene: SceneAbovePlane, indices: np.ndarray, parts: np.ndarray, meant: np.ndarray, size: float
 ) -> np.ndarray:
-    """Return the detached parts that belong to the object: they hang in the air next to the ``meant`` parts and have
-    less mass.
+    """Return the indices of the detached parts that belong to the object. They do not touch the ground, are next to the
+    ``meant`` parts and have less mass.
 
     In a coarse capture, leaves are separated from their twigs, and nothing else supports them. Parts that are not
     strays may be farther away if the object is by far the nearest possible support.
@@ -87,7 +87,7 @@ def detached_parts(
         scene: the capture.
         indices: (m,) Gaussians.
         parts: (m,) connected part of each Gaussian.
-        meant: parts of the object.
+        meant: indices of the parts that are known to belong to the object.
         size: size of the object, scene units.
     """
     heights, mass = scene.heights[indices], np.bincount(parts, weights=scene.opacity[indices])

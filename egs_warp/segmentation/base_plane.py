@@ -221,7 +221,7 @@ class _Support:
     """Quality of the support on one side; each value is 0 to 1."""
 
     polygon: float
-    """Area of the support polygon divided by that of the silhouette."""
+    """Area of the support polygon divided by the area of the silhouette."""
     level: float
     """Fraction of the low columns that end at the support's level."""
     depth: float
@@ -230,7 +230,7 @@ class _Support:
 
     @property
     def score(self) -> float:
-        """Sum of the three, 0 to 3."""
+        """Sum of the three qualities, 0 to 3."""
         return self.polygon + self.level + self.depth
 
     def __str__(self) -> str:

@@ -42,8 +42,8 @@ class ExtentMeasure(enum.Enum):
     AXIS_TIPS = "axis-tips"
     """The farthest of its six axis tips, Eq. (20)."""
     ELLIPSOID = "ellipsoid"
-    """The extent of its ellipsoid along the normal, gamma sqrt(N^T Sigma N), up to sqrt 3 times that of the axis tips.
-    """
+    """The extent of its ellipsoid along the normal, gamma sqrt(N^T Sigma N), which is up to sqrt 3 times the extent of
+    the tips."""
 
 
 class StraddlingPolicy(enum.Enum):
@@ -163,8 +163,9 @@ def clear_plane(
 def half_space(cloud: GaussianCloud, plane: Plane, chosen: np.ndarray) -> GaussianCloud:
     """Return ``cloud`` with each of the ``chosen`` (n,) bool Gaussians replaced by its part above the plane.
 
-    Mass, mean and covariance are those of a normal distribution truncated at the plane: with t = -d0 / sigma and l =
-    pdf(t) / (1 - cdf(t)), mean m + l Sigma N / sigma, covariance Sigma - l (l - t) Sigma N N^T Sigma / sigma^2.
+    Mass, mean and covariance follow from truncating a normal distribution at the plane. With t = -d0 / sigma and l =
+    pdf(t) / (1 - cdf(t)), the mean is m + l Sigma N / sigma, and the covariance is Sigma - l (l - t) Sigma N N^T Sigma
+    / sigma^2.
     """
     source = np.flatnonzero(chosen).astype(np.int32)
     device = cloud.device
@@ -288,7 +289,7 @@ def _finetuned(
         return cloud
     whole = cloud if surroundings is None else concatenate(cloud, surroundings)
     scale = float(np.median(reach[straddling]))
-    # Gaussians just above the plane take over the appearance of the straddling ones.
+    # Gaussians just above the plane are trained, too: they take over the appearance of the straddling ones.
     free = np.zeros(whole.count, bool)
     free[: cloud.count] = heights < 3.0 * scale
     views = _cropped(views, cloud.subset(free[: cloud.count]))
@@ -302,8 +303,8 @@ def _finetuned(
         loss = straddling_loss(tensors, near, normal, plane.offset, options.reach)
         return options.weight / (scale * int(straddling.sum())) * loss
 
-    # Pictures with transparency are composited over random colours, so that nothing can hide in front of a background
-    # of its own colour.
+    # Composite pictures with transparency over random colours, so that no Gaussian is hidden by a background of its own
+    # colour.
     cut_out = all(view.alpha is not None for view in views)
     result = finetune(
         trained,

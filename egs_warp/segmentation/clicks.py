@@ -32,7 +32,7 @@ _SURE = 0.5
 _ALIKE = 8
 """Rank of the nearest colour whose distance measures how common a colour is on a side."""
 _BY_COLOUR = 0.5
-"""Maximum contribution of colours to the score, relative to that of distance."""
+"""Maximum contribution of colours to the score, relative to the contribution of distances."""
 _ISLAND = 0.1
 """Fraction of the retained part. A connected part that is smaller and has no click is dropped."""
 
@@ -57,10 +57,10 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
     """Return the click at pixel (``u``, ``v``), from the top left corner of ``camera``'s picture; None if nothing is
     there.
 
-    Only a window about the click is rendered. The depth of the click is the one at which the blending weight, summed
-    from the front, reaches a quarter of its total, so that a click on foliage selects the leaves and not the wall
-    visible between them. Haze in the air, as in captures from a turntable, is ignored if the other Gaussians have
-    enough weight. The hits are the Gaussians that paint the window at that depth.
+    Only a window about the click is rendered. At the depth of the click, the blending weight, summed from the front,
+    reaches a quarter of its total, so that a click on foliage selects the leaves and not the wall visible between them.
+    Haze in the air, as in captures from a turntable, is ignored if the other Gaussians have enough weight. The hits are
+    the Gaussians that paint the window at that depth.
     """
     reach = max(1, round(_RADIUS * max(camera.width, camera.height)))
     left, top, side = int(u) - reach, int(v) - reach, 2 * reach + 1
@@ -99,9 +99,9 @@ def removed_by_clicks(
 ) -> np.ndarray:
     """(m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that ``clicks`` remove.
 
-    A click beside the object that hits something lower than ``low`` selects something on the ground, such as a shadow:
-    it removes nothing that is higher than both ``low`` and twice the height of what it hits. ``heights`` (m,) are the
-    heights of the nodes above the ground, scene units.
+    If all hits of a click beside the object are lower than ``low``, the click selects something on the ground, such as
+    a shadow. Then it does not remove Gaussians that are higher than ``low`` and higher than twice its highest hit.
+    ``heights`` (m,) are the heights of the nodes above the ground, scene units.
     """
     removed = np.zeros(len(nodes), bool)
     mine = [click for click in clicks if click.inside]

@@ -1,5 +1,5 @@
-"""Background from the framing of photos: photographers keep the object in the picture, and what most photos do not show
-is not part of it."""
+"""Background found from the framing of photos: photographers keep the object in the picture, so Gaussians that few
+photos contain do not belong to it."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ class SplatGraph:
     def distances(self, seeds: np.ndarray) -> np.ndarray:
         """(n,) length of the shortest path along the links from each Gaussian to one of the ``seeds`` (k,); infinite if
         there is none."""
-        # Paths of zero length would count as missing links.
+        # Links of zero length would be treated as missing.
         links = coo_array((np.maximum(self.length, 1e-9), (self.first, self.second)), shape=(self.count,) * 2)
         return dijkstra(links.tocsr(), directed=False, indices=seeds, min_only=True)
 
@@ -116,7 +116,7 @@ class SplatGraph:
             score: (n,) cost of excluding a Gaussian, or, if negative, of including it.
             included: (n,) bool, always included.
             excluded: (n,) bool, always excluded.
-            smoothness: factor of the links' strength, the cost of cutting them.
+            smoothness: factor of the links' strength, which is the cost of cutting them.
 
         Returns:
             (n,) bool, True for included Gaussians.

@@ -195,10 +195,10 @@ def _haze_indices(scene: SceneAbovePlane, object_indices: np.ndarray, size: floa
 
 
 def _is_own_haze(scene: SceneAbovePlane, haze: np.ndarray, object_mask: np.ndarray, size: float) -> np.ndarray:
-    """(k,) bool, True for the Gaussians ``haze`` (k,) within the object ``object_mask`` (n,) bool, or near it with its
-    colours.
+    """(k,) bool, True for the Gaussians ``haze`` (k,) that are inside the object ``object_mask`` (n,) bool, or near it
+    with similar colours.
 
-    Left in the background, it would look like a ghost of the object.
+    In the background, this haze would remain as a ghost of the object.
     """
     own = scene.is_within(haze, object_mask, size)
     if len(haze) == 0 or not object_mask.any():

@@ -44,9 +44,9 @@ class PlaneFit:
     """A fitted plane and the quality of the fit."""
 
     plane: Plane
-    """Fitted plane; its normal points to the cameras' side."""
+    """Fitted plane; its normal points to the side of the cameras."""
     noise: float
-    """Standard deviation (robust) of relative depth over the pixels on the plane."""
+    """Robust standard deviation of the relative depth error over the pixels on the plane."""
     inlier_share: float
     """Fraction of the masked pixels that the plane explains, 0 to 1."""
     pixel_count: int

@@ -109,8 +109,7 @@ def _best_plane(
         return None
     normals, through = normals[level], a[level]
     offsets = -np.einsum("ij,ij->i", normals, through)
-    # Number of points near each plane, weighted smoothly: a point on the plane counts as 1, one at the band's edge as
-    # 0.
+    # Smoothly weighted number of points near each plane; the weight is 1 on the plane and 0 at the band's edge.
     scores = np.array(
         [
             np.clip(1.0 - ((points @ normal + offset) / band) ** 2, 0.0, None).sum()
@@ -162,7 +161,7 @@ def refine_plane(
 ) -> PlaneFit:
     """Refit ``plane`` to the depth of ``cloud`` rendered through ``cameras``, Eq. (18), (19).
 
-    The masks are those of ``plane_views``. Raises ``UserError`` if no camera sees the plane.
+    The masks are computed as in ``plane_views``. Raises ``UserError`` if no camera sees the plane.
     """
     surfaces = _surfaces(cloud, plane, cameras, radius, object_mask)
     views = _masked(surfaces, plane, centre, radius, _BAND * radius)

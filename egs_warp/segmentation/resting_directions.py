@@ -18,11 +18,12 @@ _MIN_POINTS = 10
 _MIN_WIDTH_RATIO = 0.1
 """Minimum ratio of the two standard deviations along a support: a body does not rest on a line."""
 _MAX_TURN = np.cos(np.radians(10.0))
-"""Cosine of the maximum angle between the normal of a facet and that of the fitted plane."""
+"""Cosine of the maximum angle between the normals of a facet and of the fitted plane."""
 
 
 def resting_directions(points: np.ndarray, *, at_most: int) -> np.ndarray:
-    """(m, 3) unit up directions, at most ``at_most``, in which ``points`` (n, 3) can rest, those on large facets first.
+    """(m, 3) unit up directions, at most ``at_most``, in which ``points`` (n, 3) can rest, in descending order of the
+    area of their facets.
 
     Empty if the points have no volume.
     """

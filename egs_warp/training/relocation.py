@@ -35,7 +35,7 @@ _REGULARIZATION = 0.01
 _JITTER = 5e5
 """Noise relative to the learning rate of the means."""
 _SETTLING_FROM, _FINAL_RATE = 0.5, 0.1
-"""Fraction of the steps from which all learning rates but that of the means decrease, and their final fraction of the
+"""Fraction of the steps from which all learning rates except the means' decrease, and the ratio of the final to the
 initial rate."""
 
 

@@ -104,7 +104,7 @@ class SessionRecording:
         Args:
             folder: parent folder.
             drawn_as: render data of the creature.
-            records: all motions of the session; those that start during the recording are written.
+            records: all motions of the session; only motions that start during the recording are written.
             requests: request of each motion.
             source: name of the capture, for the report.
             requested: options of the session, for the report.

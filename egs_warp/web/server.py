@@ -163,7 +163,8 @@ class PageServer:
 
 
 async def _first_to_end(*coroutines: Coroutine[None, None, None]) -> None:
-    """Run the coroutines until one ends, then cancel the others; raises the error of the one that ended."""
+    """Run the coroutines until one of them ends, then cancel the others. An error of the ended coroutine is raised
+    again."""
     tasks = [asyncio.create_task(coroutine) for coroutine in coroutines]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -184,7 +185,7 @@ async def _send_packets(page: WebSocket, feed: FrameFeed) -> None:
 
 
 async def _receive_messages(page: WebSocket, feed: FrameFeed) -> None:
-    """Pass the messages of the page to ``feed``; answer an invalid one with an error."""
+    """Pass the messages of the page to ``feed``; answer an invalid message with an error."""
     while True:
         try:
             message = json.loads(await page.receive_text())
