@@ -46,7 +46,7 @@ class _Textured:
     vertices: np.ndarray
     """(V, 3) float64, z up, of height 1, standing on z = 0."""
     faces: np.ndarray
-    """(F, 3) int32."""
+    """(F, 3) int32, triangles as indices of vertices."""
     places: np.ndarray
     """(F, 3, 2) texture coordinates of each corner, v up."""
     pictures: tuple[np.ndarray, ...]

@@ -27,7 +27,7 @@ NEAREST = 12
 
 @dataclass(frozen=True)
 class Drop:
-    """A recorded fall."""
+    """A recorded fall of a soft body."""
 
     frames: np.ndarray
     """(F, N, 3) m, node positions at every step."""

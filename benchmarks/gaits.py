@@ -183,7 +183,7 @@ def _push_failure(reached: dict[str, Any]) -> str | None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the cells."""
+    """Run the cells and print the table."""
     parser = flags(__doc__, quick="three bodies, short distances", device="cpu")
     workers_flag(parser)
     parser.add_argument("--nodes", type=int, default=500, help="approximate number of nodes of the cages")

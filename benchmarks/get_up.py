@@ -95,7 +95,7 @@ def summary(rows: list[Row]) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the cells."""
+    """Run the cells and print the table."""
     parser = flags(__doc__, quick="three bodies, tilted by 90 degrees", device="cpu")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--nodes", type=int, default=150, help="approximate number of nodes of the cages")

@@ -25,9 +25,9 @@ class PaintedMesh:
 
     name: str
     vertices: np.ndarray
-    """(V, 3) float64."""
+    """(V, 3) float64, vertices."""
     faces: np.ndarray
-    """(F, 3) int32."""
+    """(F, 3) int32, triangles as indices of vertices."""
     paint: Paint
     glossy: bool = False
     """True if the mesh is lit by lamps that rotate with each part of the body. A capture stores light in this form."""

@@ -187,7 +187,7 @@ def _overlaps(
 
 
 def aims_of(rows: Sequence[Row]) -> dict[str, bool]:
-    """Return the aims."""
+    """Return the aims, computed from the rows."""
     lit = [row for row in rows if row["is_lit"]]
     shadows = [row for row in lit if "iou" in row]
     gain = np.mean([row["psnr"] - row["psnr_before"] for row in lit])

@@ -319,8 +319,8 @@ def _painted(
 
 
 def _bridge(fields: dict[str, np.ndarray], is_object: np.ndarray, random: np.random.Generator) -> None:
-    """Widen half of the Gaussians where the object touches its surroundings, and mix their colours with those of the
-    other side."""
+    """Widen half of the Gaussians where the object touches its surroundings, and mix their colours with the colours of
+    the other side."""
     means, sh, scales = fields["means"], fields["sh"].copy(), fields["log_scales"]
     for side in (is_object, ~is_object):
         own, other = np.flatnonzero(side), np.flatnonzero(~side)

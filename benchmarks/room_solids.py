@@ -26,11 +26,11 @@ class Solid:
     """An ellipsoid or a box."""
 
     centre: np.ndarray
-    """(3,) scene units."""
+    """(3,) centre, scene units."""
     half: np.ndarray
     """(3,) half axes, or half sides of a box, scene units."""
     colour: Colour
-    """Linear albedo."""
+    """Linear albedo of the surface."""
     turn: np.ndarray = field(default_factory=lambda: np.eye(3))
     """(3, 3) axes of the solid in the room, as columns."""
     is_box: bool = False
@@ -99,7 +99,7 @@ class SceneLight:
     direction: np.ndarray
     """(3,) unit vector to the light."""
     half_angle: float
-    """Degrees."""
+    """Half angle of the light's disc, degrees."""
     key: float
     """Irradiance of a surface that faces the light."""
 

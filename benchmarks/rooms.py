@@ -112,7 +112,7 @@ def is_clear(row: Row) -> bool:
 
 
 def aims_of(rows: Sequence[Row], names: Sequence[str]) -> dict[str, bool]:
-    """Return the aims."""
+    """Return the aims, computed from the rows of the rooms ``names``."""
     successes = {how: sum(row["success"] for row in rows if row["how"] == how) for how in CLICKS}
     return {
         "one_click": successes["1 click"] >= 0.9 * len(names),

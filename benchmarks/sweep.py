@@ -207,7 +207,7 @@ def friction_spent(trajectory: Trajectory) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the sweep."""
+    """Run all cases and print the summary."""
     parser = flags(__doc__, quick="three runs", device="cpu", seed="of the Gaussians of the built-in bodies")
     workers_flag(parser)
     parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")

@@ -121,7 +121,7 @@ class Subject:
 
     @cached_property
     def photos(self) -> list[TrainingView]:
-        """Training views."""
+        """Photographs of the mesh at rest, for training."""
         return scenes.photographs(self.mesh, self.options.size, self.options.views, self.options.device)
 
     def moved_nodes(self) -> dict[str, np.ndarray]:
@@ -184,7 +184,7 @@ class View:
 
     camera: Camera
     picture: np.ndarray
-    """(H, W, 3) colour."""
+    """(H, W, 3) colour of the image."""
     coverage: np.ndarray
     """(H, W) fraction of each pixel that the mesh covers."""
 

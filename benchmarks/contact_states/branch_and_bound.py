@@ -69,7 +69,7 @@ class ExactResult:
     y: np.ndarray
     """(variables,) unknowns of ``PyramidProgram``."""
     states: np.ndarray
-    """(n,) contact states."""
+    """(n,) contact states of the best point."""
     objective: float
     bound: float
     """Lower bound on the objective of all contact states."""

@@ -26,7 +26,7 @@ class Pivot(NamedTuple):
     """Magnitude of the multiplier that proposes the move."""
     contact: int
     state: int
-    """New state."""
+    """Proposed new state of the contact."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class ContactLayout:
 
     @property
     def slip(self) -> slice:
-        """Slice of lambda."""
+        """Slice of the slip variables lambda."""
         return slice(self.tangent.stop, self.variables)
 
     def paired(self, part: slice) -> slice:
@@ -100,11 +100,11 @@ class Pairs:
     rows."""
 
     normal: np.ndarray
-    """(n,) x: f_n."""
+    """(n,) x: normal forces f_n."""
     friction: np.ndarray
-    """(n, n_d) x: f_t along each of the directions D."""
+    """(n, n_d) x: friction forces f_t along each of the directions D."""
     slip: np.ndarray
-    """(n,) x: lambda."""
+    """(n,) x: slip variables lambda."""
     gap: np.ndarray
     """(n,) w of ``normal``: the normal measure c."""
     drift: np.ndarray

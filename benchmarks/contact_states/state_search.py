@@ -66,7 +66,7 @@ class SearchResult:
     relaxed: bool
     """True if no tried states were feasible; ``y`` then only satisfies 0 <= x and 0 <= w."""
     states: np.ndarray
-    """(n,) contact states."""
+    """(n,) contact states of the solution."""
     objective: float
     """Objective, including the QP's constant; infinite if ``y`` is None."""
     qp_count: int
@@ -88,7 +88,7 @@ class _Search:
     count: int = 0
     infeasible: int = 0
     relaxed: QpSolution | None = None
-    """Optimum without complementarity. Its objective is a lower bound for all states."""
+    """Optimum without complementarity. Its objective is a lower bound on the objectives of all states."""
     best: QpSolution | None = None
     states: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     """(n,) states of ``best``."""

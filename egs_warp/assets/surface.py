@@ -32,7 +32,7 @@ class SurfaceSamples:
     """Points spread evenly over a surface."""
 
     points: np.ndarray
-    """(n, 3) float64, scene units."""
+    """(n, 3) float64, positions, scene units."""
     normals: np.ndarray
     """(n, 3) float64, unit vectors, outward."""
     spacing: float

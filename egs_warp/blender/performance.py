@@ -114,7 +114,7 @@ class Performance:
     node_mass: np.ndarray
     """(N,) kg; empty in a bundle."""
     height: float
-    """Body height, m."""
+    """Height of the body, m."""
     muscles: Muscles | None
     """None in a bundle."""
     contacts: Contacts | None

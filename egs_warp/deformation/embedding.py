@@ -74,7 +74,7 @@ class CageLocator:
         with wp.ScopedDevice(self.device):
             self._nodes = wp.array(local, dtype=Vec3)
             self.tets = wp.array(mesh.tets, dtype=wp.vec4i)
-            """(T,) vec4i node indices."""
+            """(T,) vec4i, node indices of each tetrahedron."""
             self.inverse_edges = wp.array(np.linalg.inv(edges), dtype=Mat33)
             """(T,) mat33d, D_m^-1 of each rest tetrahedron, 1/m."""
             self._box_lowers = wp.array((corners.min(axis=1) - margin).astype(np.float32), dtype=wp.vec3)
@@ -190,7 +190,7 @@ class GaussianEmbedding:
     arms: wp.array
     """(n, 6) float32, m, arm lengths of the three ends of T+, then of T-; gamma s_j, or less where shortened."""
     cage: CageLocator
-    """Rest cage."""
+    """Locator of the rest cage in which the Gaussians are embedded."""
     gamma: float
     """Arm length in standard deviations, before shortening."""
 

@@ -89,7 +89,7 @@ class InpaintResult:
     """A background with new floor."""
 
     cloud: GaussianCloud
-    """Scene units; first the retained Gaussians, then the new ones."""
+    """Background with the new floor, scene units; first the retained Gaussians, then the new ones."""
     is_new: np.ndarray
     """(n,) bool, True for new Gaussians."""
     removed: int
@@ -97,7 +97,7 @@ class InpaintResult:
     window: PlaneWindow
     """Window of the face-on view."""
     hole: np.ndarray
-    """(rows, columns) bool, on the window."""
+    """(rows, columns) bool, the filled hole on the window."""
     before: RectifiedImage
     """Face-on picture of the floor before the hole is filled."""
     painted: np.ndarray

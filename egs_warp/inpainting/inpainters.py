@@ -46,7 +46,7 @@ class OpenCvMethod(enum.Enum):
     TELEA = "telea"
     """Fast marching (Telea 2004)."""
     NAVIER_STOKES = "ns"
-    """Isophotes continued into the hole (Bertalmio et al. 2001)."""
+    """Continuation of isophotes into the hole (Bertalmio et al. 2001)."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class TorchScriptInpainter:
 
     path: Path
     device: str = "cpu"
-    """PyTorch device."""
+    """PyTorch device on which the network runs."""
 
     def fill(
         self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None

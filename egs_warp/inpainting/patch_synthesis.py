@@ -201,7 +201,7 @@ class _Work:
         self._reach = max(level.hole.shape)
         self._holes_at, self._targets_at = np.argwhere(level.hole), np.argwhere(level.targets)
         self.picture = level.image.copy()
-        """(H, W, 3) float32."""
+        """(H, W, 3) float32, colours of the level."""
 
         def upload(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self._device)

@@ -134,7 +134,7 @@ class RectifiedImage:
     colour: np.ndarray
     """(rows, columns, 3) float32, 0 to 1; black where it is empty."""
     alpha: np.ndarray
-    """(rows, columns) float32, 0 to 1."""
+    """(rows, columns) float32, opacity, 0 to 1."""
     height: np.ndarray
     """(rows, columns) float32, height of the surface above the plane, scene units; 0 where it is empty."""
 

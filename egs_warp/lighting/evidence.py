@@ -84,11 +84,11 @@ class GroundEvidence:
     """The object, or a thinned subset of its Gaussians; None without ground."""
     plane: Plane
     centre: np.ndarray
-    """(3,) on the plane under the object."""
+    """(3,) point on the plane under the object."""
     size: float
     """Height of the object over the ground, or half of its width if that is larger."""
     points: np.ndarray
-    """(n, 3) on the ground."""
+    """(n, 3) points on the ground."""
     log_brightness: np.ndarray
     """(n,) natural logarithm of linear luminance."""
     causes: np.ndarray | None
@@ -191,7 +191,7 @@ class ShadingEvidence:
     """Brightness and normals of an object's surfaces."""
 
     normals: np.ndarray
-    """(n, 3) unit vectors."""
+    """(n, 3) unit normals of the surfaces."""
     log_brightness: np.ndarray
     """(n,) natural logarithm of linear luminance."""
     groups: np.ndarray

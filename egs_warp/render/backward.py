@@ -23,15 +23,15 @@ class CloudGradients:
     """Gradient of a scalar loss with respect to all inputs of the image."""
 
     means: wp.array
-    """(n,) vec3."""
+    """(n,) vec3, with respect to the means."""
     rotations: wp.array
     """(n,) vec4, with respect to the stored quaternion; orthogonal to it, because its length has no effect."""
     log_scales: wp.array
-    """(n,) vec3."""
+    """(n,) vec3, with respect to the log scales."""
     opacity_logits: wp.array
-    """(n,) float32."""
+    """(n,) float32, with respect to the opacity logits."""
     sh: wp.array
-    """(n, K) vec3."""
+    """(n, K) vec3, with respect to the SH coefficients."""
     screen: wp.array | None
     """(n,) vec2, with respect to the screen position in pixels; None if not requested."""
     pose_rotation: wp.array | None

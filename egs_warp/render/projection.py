@@ -27,7 +27,7 @@ class ProjectedGaussians:
     ellipse: wp.array
     """(n,) vec4: centre x, y in pixels, then a and shear of -ln(alpha / opacity) = a (dx + shear dy)^2 + v dy^2."""
     falloff: wp.array
-    """(n,) vec2: v, ln(opacity)."""
+    """(n,) vec2: coefficient v and ln(opacity) of the same equation."""
     colour_depth: wp.array
     """(n,) vec4: red, green, blue (display-referred, at least 0) and z-depth."""
     slot_end: wp.array

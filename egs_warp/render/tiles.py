@@ -41,7 +41,7 @@ class TileLists:
 
     @property
     def tile_count(self) -> int:
-        """Number of tiles."""
+        """Number of tiles of the image."""
         return self.tile_start.shape[0] - 1
 
 

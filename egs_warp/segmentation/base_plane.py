@@ -49,7 +49,7 @@ class _Underside:
     heights: np.ndarray
     """(n,) heights of all means along the up direction, scene units."""
     opacities: np.ndarray
-    """(n,) opacities."""
+    """(n,) opacities of the Gaussians, 0 to 1."""
     low: float
     high: float
     """Robust highest height, scene units; ``low`` is the robust lowest one."""
@@ -58,7 +58,7 @@ class _Underside:
     columns: np.ndarray
     """(c, 2) integer position of each column."""
     column_width: float
-    """Scene units."""
+    """Width of a column, scene units."""
     centre: np.ndarray
     """(2,) centre of opacity, in columns."""
 

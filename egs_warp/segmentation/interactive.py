@@ -68,7 +68,7 @@ class ClickGraph:
     middles: np.ndarray
     """(k, 3) centre of each cluster, scene units."""
     means: np.ndarray
-    """(n, 3) float64, scene units."""
+    """(n, 3) float64, means of the Gaussians, scene units."""
 
     @classmethod
     def of(cls, cloud: GaussianCloud) -> ClickGraph:

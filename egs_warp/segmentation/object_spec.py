@@ -17,9 +17,9 @@ class Box:
     """An axis-aligned box in the capture's frame."""
 
     low: np.ndarray
-    """(3,) lower corner."""
+    """(3,) corner with the lowest coordinates, scene units."""
     high: np.ndarray
-    """(3,) upper corner."""
+    """(3,) corner with the highest coordinates, scene units."""
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """(n,) bool, True for points (n, 3) in the box."""

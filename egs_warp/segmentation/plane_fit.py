@@ -95,7 +95,7 @@ class _Pixels:
     rays: np.ndarray
     """(p, 3) rays of z-depth 1."""
     depth: np.ndarray
-    """(p,) rendered depth."""
+    """(p,) rendered z-depth of each pixel, scene units."""
     first_view: np.ndarray
     """(p,) bool, pixels of the first view."""
 

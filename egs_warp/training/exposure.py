@@ -61,5 +61,5 @@ class ExposureModel:
         self._visits = list(state["visits"])
 
     def matrices(self) -> np.ndarray:
-        """(views, 3, 4) float64 colour maps."""
+        """Return the colour maps of all views, (views, 3, 4) float64."""
         return (self._identity + self._offsets).double().cpu().numpy()

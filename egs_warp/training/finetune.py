@@ -37,7 +37,7 @@ class Densification(enum.Enum):
     """Changes to the number and positions of Gaussians."""
 
     NONE = "none"
-    """No changes."""
+    """The number and order of Gaussians do not change."""
     RELOCATION = "relocation"
     """Faint Gaussians move to opaque ones, the number grows to a cap, and means are perturbed by noise (MCMC)."""
 
@@ -77,7 +77,7 @@ class FinetuneOptions:
     iterations: int = 1000
     rates: LearningRates = field(default_factory=LearningRates)
     ssim_weight: float = 0.2
-    """Loss = (1 - w) L1 + w (1 - SSIM)."""
+    """Weight w of SSIM in the loss (1 - w) L1 + w (1 - SSIM)."""
     background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
     """Background colour. None draws a random one in each step, which requires views with alpha."""
     densification: Densification = Densification.NONE
@@ -100,13 +100,13 @@ class GaussianTensors:
     """Parameters under training, as leaf tensors with the conventions of ``GaussianCloud``."""
 
     means: torch.Tensor
-    """(n, 3) means."""
+    """(n, 3) means, scene units."""
     rotations: torch.Tensor
     """(n, 4) quaternions, w x y z."""
     log_scales: torch.Tensor
-    """(n, 3) log scales."""
+    """(n, 3) natural logarithms of the standard deviations."""
     opacity_logits: torch.Tensor
-    """(n,) opacity logits."""
+    """(n,) logits of the opacities."""
     sh_band_0: torch.Tensor
     """(n, 1, 3) SH coefficients of band 0."""
     sh_rest: torch.Tensor

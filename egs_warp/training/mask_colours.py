@@ -69,7 +69,7 @@ class _MaskView:
     """Camera at the size of the reduced mask."""
     lens: Lens | None
     black: np.ndarray
-    """(H, W) bool."""
+    """(H, W) bool, True for black pixels."""
 
     @classmethod
     def of(cls, one: PosedImage) -> _MaskView | None:

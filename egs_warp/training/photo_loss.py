@@ -32,7 +32,7 @@ class Target:
     """A photo on the device of the training."""
 
     image: torch.Tensor
-    """(H, W, 3) float32."""
+    """(H, W, 3) float32, colours of the photo, 0 to 1."""
     alpha: torch.Tensor | None
     """(H, W) float32; if given, the photo is composited over the backdrop of the step."""
     weight: torch.Tensor | None

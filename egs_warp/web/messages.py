@@ -35,7 +35,7 @@ class PlayScript:
     """Perform these motions next; they replace the queued motions."""
 
     script: Script
-    """The motions."""
+    """The motions to perform."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Steer:
     """Move at these speeds until the next command; this replaces the queued motions. Zero speeds stop the body."""
 
     command: Drive
-    """The speeds."""
+    """Requested speeds of the body."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Restyle:
     """Set the style of all later jumps."""
 
     style: Style
-    """The factors."""
+    """Factors of the style's parameters."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Pause:
     """Pause or continue the simulation."""
 
     on: bool
-    """True to pause."""
+    """True to pause, False to continue."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Record:
     """Start a take, or end and write it."""
 
     on: bool
-    """True to start."""
+    """True to start, False to end."""
 
 
 @dataclass(frozen=True)

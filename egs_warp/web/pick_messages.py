@@ -52,7 +52,7 @@ class TurnFront:
     """Set the front of the active object."""
 
     direction: np.ndarray
-    """(3,) unit vector."""
+    """(3,) unit vector of the front."""
 
 
 @dataclass(frozen=True)
@@ -88,12 +88,12 @@ class Undo:
 
 @dataclass(frozen=True)
 class Save:
-    """Write the file."""
+    """Write the file of the picked objects."""
 
 
 @dataclass(frozen=True)
 class RunAnimate:
-    """Write the file and film the active object."""
+    """Write the file of the picked objects and film the active one."""
 
     motion: str
 

@@ -97,7 +97,7 @@ class PickSource:
     """Frame of the page in the capture."""
     name: str
     path: Path
-    """File to write."""
+    """File to which the picked objects are written."""
     commands: PickCommands
     first: Callable[[], Sequence[PickedObject]] = tuple
     """Returns the initial objects, in the frame of the capture: from a file or from the command line."""

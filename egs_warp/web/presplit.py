@@ -17,7 +17,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.pipelines.creature import Creature
 
 MODE_COUNT = 6
-"""Number of modes."""
+"""Number of modes for which the Gaussians are split."""
 MODE_AMPLITUDE = 0.3
 """Largest nodal displacement of a mode, body heights."""
 

@@ -32,7 +32,7 @@ HOST = "127.0.0.1"
 MAX_MESSAGE_BYTES = 65_536
 """Maximum size of a message, bytes; a larger one closes the socket."""
 _HOST_NAMES = frozenset({"127.0.0.1", "localhost"})
-"""Host names that requests may use."""
+"""Host names that the server accepts in requests."""
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",

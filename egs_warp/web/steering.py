@@ -55,7 +55,7 @@ class Task:
     """A queued motion and its request."""
 
     part: MotionTask
-    """The motion."""
+    """The motion to perform."""
     request: MotionRequest
     """The request, for a script."""
 

@@ -35,7 +35,7 @@ class UserForces:
         self._spring.target = np.array(request.target)
 
     def release(self) -> None:
-        """End the pull."""
+        """End the user's pull."""
         self._spring = None
 
     def push(self, request: PushOnce) -> None:
