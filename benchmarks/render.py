@@ -87,7 +87,7 @@ def cuda_rows(
         row["difference"] = {
             name: difference(pictures["ours"], picture) for name, picture in pictures.items() if name != "ours"
         }
-        # Last, because the other renderers share leaf tensors, whose gradients they overwrite.
+        # Measure these gradients last, because the other renderers share leaf tensors, whose gradients they overwrite.
         for name in ("ours", "gsplat"):
             if name in renderers:
                 both(name)
@@ -354,7 +354,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table(gaussians="9d", size="9s", what="<16", renderer="<12", ms="9.3f")
     if options.device.startswith("cuda"):
         cells = CELLS[:4] if options.quick else CELLS
-        # First, because the memory pool records only the peak since the process started.
+        # Measure the memory first, because the memory pool records only the peak since the process started.
         rows.append(memory_row(seed=options.seed))
         rows += cuda_rows(points, cells=cells, seed=options.seed, repeats=repeats, table=table, others=options.beside)
         if "gsplat" in rows[-1]["forward"]:

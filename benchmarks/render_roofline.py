@@ -159,8 +159,9 @@ def _operations(count: int, counts: dict[str, float]) -> dict[str, float]:
         "project": count * 150 + visible * 120,
         # The span of each tile row, about two rows per three pairs; sorting is not arithmetic.
         "lists": pairs * 30,
-        # Alpha: 12; blend: 10.
+        # 12 operations for alpha, 10 for blending.
         "composite": hits * 22,
-        # Alpha: 12; value, slope and transmittance: 20; ten sums: 24. Then the chain rule of each visible Gaussian.
+        # 12 for alpha, 20 for value, slope and transmittance, 24 for ten sums; then the chain rule of each visible
+        # Gaussian.
         "backward": hits * 56 + visible * 600 + pairs * 12,
     }

@@ -248,8 +248,8 @@ def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) -> tuple[np.ndarray, np.ndarray, float]:
     """Add the stains around the hole if enough floor remains to copy from.
 
-    Returns the hole and the known floor, both (rows, columns) bool, and the area of the stains as a fraction of the
-    hole's.
+    Returns the hole and the known floor, both (rows, columns) bool, and the fraction of the enlarged hole that was
+    stained.
     """
     stain = stain_around(hole, known, before.colour)
     if not stain.any():
@@ -258,7 +258,7 @@ def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) 
     try:
         _check(whole, left)
     except UserError:
-        # Stained floor is better than no floor.
+        # Copying from stained floor is better than having too little floor to copy from.
         return hole, known, 0.0
     return whole, left, float((whole & ~hole).sum() / whole.sum())
 

@@ -192,7 +192,7 @@ def _draw(
         with translate_out_of_memory(cloud, camera):
             projected = project(cloud, view, antialiased=task.antialiased, threads=threads)
             shape = (camera.height, camera.width)
-            # Allocated by torch, because converting a Warp array to a tensor takes as long as three launches.
+            # Allocate with torch, because converting a Warp array to a tensor takes as long as three launches.
             picture = (
                 torch.empty((*shape, 3), dtype=torch.float32, device=device),
                 torch.empty(shape, dtype=torch.float32, device=device),

@@ -186,7 +186,7 @@ def _lists_for(pairs: int, tiles: int, device: wp.Device) -> _PairBuffers | None
     if pairs == 0:
         return None
     pairs = grow_capacity(pairs)
-    # Two allocations, so that the scratch is released first.
+    # Use two allocations, so that the scratch space can be released before the lists.
     return _PairBuffers(
         *empty_pooled(device, (2 * pairs, wp.uint32), (3 * pairs, wp.int32)),
         *empty_pooled(device, (tiles + 1, wp.int32), (pairs, wp.int32), (pairs, wp.int32)),

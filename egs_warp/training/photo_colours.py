@@ -47,7 +47,8 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
         small = downscale(picture.camera, _PHOTO_SIDE)
         size = (small.width, small.height)
         whole = np.rint(picture.colour * 255.0).astype(np.uint8)
-        # Blocks of whole pixels, as in the reduced camera: resizing the whole photo would be off by up to a pixel.
+        # Average blocks of whole pixels, as in the reduced camera; resizing the whole photo would shift it by up to a
+        # pixel.
         block = picture.camera.width // small.width
         used = np.ix_(range(block * small.height), range(block * small.width))
         photo = cv2.resize(whole[used], size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0

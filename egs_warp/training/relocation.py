@@ -51,7 +51,7 @@ class Population:
         extent: float,
         generator: torch.Generator,
     ) -> None:
-        wp.init()  # Warp must be initialised with torch's context before any kernel is launched
+        wp.init()  # Warp receives torch's tensors before it launches any kernel
         self.tensors = tensors
         self._rates = {name: rates[name] * (extent if name == "means" else 1.0) for name in tensors}
         self._extent = extent

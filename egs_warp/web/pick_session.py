@@ -106,7 +106,8 @@ class PickSource:
     cameras: Sequence[Camera] = ()
     """Cameras of the capture, in the capture's frame; empty if they are unknown."""
     film: str | None = None
-    """Motion of the film that is made after the page is closed; None if the page starts ``commands``."""
+    """Motion of the film that the session's owner makes when the user requests it; None if the page starts
+    ``commands``."""
 
 
 class PickSession:

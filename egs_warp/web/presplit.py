@@ -1,7 +1,7 @@
 """Split the Gaussians of a live creature before it moves.
 
 Because the motion is not known in advance, the Gaussians are split for deformations along the softest modes of the
-body, which any motion excites most.
+body. In any motion, the body bends most along these modes.
 """
 
 from __future__ import annotations

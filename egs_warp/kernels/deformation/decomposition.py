@@ -212,8 +212,8 @@ def match_columns(frame: wp.mat33, reference: wp.mat33) -> wp.vec3i:
 
 @wp.func
 def rotation_of(m: wp.mat33) -> wp.mat33:
-    """Return the ``rotation_part`` of a matrix with det > 0, where it is safe by Newton's iteration X <- (g X + X^-T /
-    g) / 2 (Higham 1986), which takes half the work."""
+    """Return the ``rotation_part`` of a matrix with det > 0. Where it is safe, Newton's iteration X <- (g X + X^-T / g)
+    / 2 (Higham 1986) is used, which takes half the work."""
     a = column(m, 0)
     b = column(m, 1)
     c = column(m, 2)

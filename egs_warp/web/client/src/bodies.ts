@@ -15,9 +15,9 @@ export interface CageTrack {
 
 export interface Body {
   splats: SplatData;
-  /** Undefined for static splats. */
+  /** Cage that moves the splats; undefined for static splats. */
   track?: CageTrack | undefined;
-  /** Undefined if the colours do not change with the normals. */
+  /** Change of the colours with the normals; undefined if the colours do not change. */
   relighting?: Relighting | undefined;
 }
 

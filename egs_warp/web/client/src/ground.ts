@@ -8,7 +8,8 @@ import { SHADOW_GLSL, WIDE_RADIUS } from "./shadow.glsl";
 
 /** Background colour behind a captured scene, and behind the creature if the ground is hidden. */
 export const BACKGROUND = 0xb9bec6;
-/** Depth below which the floor hides splats, in body heights. Pressed soles may extend less deep below the ground. */
+/** Depth below which the floor hides splats, in body heights. Pressed soles extend below the ground by less than
+ * this. */
 export const FLOOR_DEPTH = 0.015;
 const SHADOW_SIDE = 256;
 /** Radius of the contact shadow, as a fraction of the side of the shadow map. */

@@ -136,13 +136,13 @@ export class Headset {
     try {
       await this.enter(mode);
     } catch (error) {
-      // The user has declined, or the device is in use.
+      // The user has declined the session, or the device is in use.
       this.buttons[MODES.findIndex((one) => one.mode === mode)]!.title =
         error instanceof Error ? error.message : String(error);
     }
   }
 
-  /** Show on the buttons whether they enter or leave. */
+  /** Show on each button whether it enters or leaves a session. */
   private showState(): void {
     for (const [k, { mode, name, hint }] of MODES.entries()) {
       const isOn = this.mode === mode;

@@ -153,7 +153,7 @@ export class Live {
       for (const end of ["pointerup", "pointerleave", "pointercancel"]) {
         created.addEventListener(end, () => this.input.release(title));
       }
-      // The button was activated by the keyboard.
+      // Clicks without a pointer event come from the keyboard.
       created.addEventListener("click", (event) => {
         if (event.detail !== 0) return;
         this.input.press(action, title);

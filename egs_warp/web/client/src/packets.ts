@@ -40,7 +40,7 @@ export interface Facts {
   /** Identifier of the session and limits of its sliders; only for live sessions. */
   session?: string;
   limits?: { friction: [number, number]; sag: [number, number]; style: [number, number] };
-  /** Named styles. */
+  /** Named styles of jumps. */
   styles?: Record<string, Style>;
 }
 

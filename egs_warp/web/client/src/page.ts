@@ -50,9 +50,9 @@ const HELP: [string[], string][] = [
 export class Page {
   readonly viewers: Viewer[] = [];
   readonly player: Player;
-  /** Only for live sessions. */
+  /** Controls of a live session; undefined for recorded runs. */
   readonly live: Live | undefined;
-  /** Only on the page where objects are picked. */
+  /** Controls of the page on which objects are picked; undefined on other pages. */
   readonly pick: Pick | undefined;
   private readonly charts: Charts;
   private readonly legend: Legend;

@@ -10,7 +10,7 @@ import type { Viewer } from "./viewer";
 const RING_TIME = 0.35;
 
 export class PushTool {
-  /** Impulse in m sqrt(g H). */
+  /** Impulse of a push, in units of body mass times sqrt(g H). */
   strength = 0.15;
   private readonly rest: Float32Array;
   private lastPush: { where: () => THREE.Vector3; since: number } | undefined;

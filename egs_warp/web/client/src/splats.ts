@@ -104,7 +104,7 @@ export function deformedSplats(
     eye: dyno.dynoVec3(eye, "egsEye"),
     place: dyno.dynoMat4(place, "egsPlace"),
     normals: dyno.dynoSampler2D(relighting ? normalTexture(relighting.normals) : cage, "egsNormals"),
-    // Zero without a main light.
+    // The irradiance is zero without a main light.
     irradiance: dyno.dynoMat4(
       new THREE.Matrix4().fromArray(relighting?.irradiance ?? new Array<number>(16).fill(0)),
       "egsIrradiance",

@@ -9,7 +9,7 @@ export interface Camera {
   fov: number;
 }
 
-/** Properties of the JSON text. */
+/** Properties in the JSON text of a bundle. */
 export interface Facts {
   title?: string;
   licence?: string;
@@ -25,7 +25,7 @@ export interface Facts {
 export interface BundleCage {
   rest: Float32Array;
   tets: Int32Array;
-  /** Triangles of the surface. */
+  /** Triangles of the cage's surface. */
   surface: Int32Array;
   embedding: Embedding;
   /** Node positions of the frames that have arrived. */
@@ -36,7 +36,7 @@ export interface BundleBody {
   name: string;
   antialiased: boolean;
   splats: SplatData;
-  /** Undefined for static splats. */
+  /** Cage that moves the splats; undefined for static splats. */
   cage?: BundleCage;
 }
 

@@ -18,7 +18,7 @@ const LOAD_MARGIN = "300px";
 export class EgsPlayer extends HTMLElement {
   static readonly observedAttributes = ["src", "poster", "loop", "controls", "speed", "background"];
 
-  /** Holds the canvas of the stage. */
+  /** Element that contains the canvas of the stage. */
   private readonly frame = element("div", { class: "frame" });
   private readonly image = element("img", { alt: "", hidden: "" });
   private readonly message = element("p", { class: "message", role: "alert", hidden: "" });
