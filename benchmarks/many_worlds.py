@@ -218,7 +218,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def summary(rows: list[Row], device: str) -> dict[str, Any]:
-    """Return the aims, and a reason for each that is None."""
+    """Return the aims, and a reason for each aim that is None."""
     best = {
         nodes: max((row["rate"] for row in rows if abs(row["nodes"] - nodes) <= NODE_TOLERANCE * nodes), default=None)
         for nodes in AIMS

@@ -39,8 +39,8 @@ def add_creature(context: bpy.types.Context, path: Path, *, set_up_scene: bool) 
 
     Args:
         context: The context of Blender.
-        path: As for ``read_performance``. set_up_scene: Set frame rate, frame range and the render settings that the
-            splats need.
+        path: As for ``read_performance``.
+        set_up_scene: Set frame rate, frame range and the render settings that the splats need.
 
     Raises:
         ReadError: the files cannot be read.

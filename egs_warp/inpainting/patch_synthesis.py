@@ -133,7 +133,7 @@ def _with_half_turn(
 
 
 def _start(level: _Level, shift_limit: float) -> np.ndarray:
-    """(H, W) sources int32 (row, column), each with a whole known patch, from the offsets that match the rim."""
+    """(H, W, 2) int32, a source with a whole known patch for each pixel, from the offsets that match the rim."""
     sources = labelled_sources(level.image, level.hole, level.known, level.is_source, shift_limit=shift_limit)
     return _with_whole_patches(sources, level)
 

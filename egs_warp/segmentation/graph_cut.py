@@ -70,7 +70,7 @@ class SplatGraph:
 
         Args:
             cluster: (n,) int, cluster of each Gaussian, from 0.
-            (k, 3) centre of each cluster, scene units.
+            points: (k, 3) centre of each cluster, scene units.
             colours: (k, 3) mean colour of each cluster, 0 to 1.
         """
         count = len(points)

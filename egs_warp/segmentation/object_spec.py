@@ -34,7 +34,7 @@ class ObjectSpec:
     masks: tuple[MaskedView, ...] = ()
     box: Box | None = None
     point: np.ndarray | None = None
-    """(3,) on or in the object, scene units."""
+    """(3,) point on or in the object, scene units."""
     clicks: tuple[Click, ...] = ()
     """Clicks, each of which adds the Gaussians that it hits and their connected parts, or removes them."""
     picked: np.ndarray | None = None

@@ -39,7 +39,7 @@ class FoundPlane:
 
     plane: Plane
     support: float
-    """0 to 1, share of the visible surface."""
+    """Share of the visible surface that lies in the plane, 0 to 1."""
 
 
 def find_planes(
