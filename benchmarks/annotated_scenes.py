@@ -1,8 +1,8 @@
 """Hand-drawn annotations of objects and ground in real scenes, read from ``tests/data/rooms``.
 
 Each scene has eight views: cameras on a ring around the object, or photos of it. In each view a person drew the
-object's outline by hand (polygons, refined by GrabCut by at most five pixels towards image edges, then checked),
-before any method was run on the scenes, and marked six points on the supporting surface.
+object's outline by hand, before any method was run on the scenes, and marked six points on the supporting surface. The
+outlines are polygons, refined by GrabCut by at most five pixels towards image edges, and then checked.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class DrawnView:
     ground: np.ndarray
     """(k, 2) pixels that show the supporting surface."""
     hidden: np.ndarray | None = None
-    """(H, W) bool, pixels where something in front hides the object; they do not count. None if there are none."""
+    """(H, W) bool, pixels where something in front hides the object; they are ignored. None if there are none."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,14 @@ class DrawnScene:
 
     @property
     def is_here(self) -> bool:
-        """True if the scene's data are on this machine."""
+        """True if the scene's data are available on this machine."""
         place = self.capture or self.photos
         return place is not None and place.exists()
 
 
 def read_drawn(name: str) -> DrawnScene:
-    """Read the annotations of the scene ``name``; ``views`` is empty if the scene's data are not on this machine."""
+    """Read the annotations of the scene ``name``; ``views`` is empty if the scene's data are not available on this
+    machine."""
     tree = json.loads((FOLDER / f"{name}.json").read_text())
     capture, photos = (None if tree[key] is None else data_folder() / tree[key] for key in ("capture", "photos"))
     scene = DrawnScene(name, capture, photos, ())

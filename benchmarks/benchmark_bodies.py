@@ -36,7 +36,7 @@ class Body:
     cloud: GaussianCloud
     plane: Plane
     origin: str
-    """Source of the Gaussians."""
+    """Origin of the Gaussians, for the table."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class _Textured:
     vertices: np.ndarray
     """(V, 3) float64, z up, of height 1, standing on z = 0."""
     faces: np.ndarray
-    """(F, 3) int32."""
+    """(F, 3) int32, triangles as indices of vertices."""
     places: np.ndarray
     """(F, 3, 2) texture coordinates of each corner, v up."""
     pictures: tuple[np.ndarray, ...]
@@ -201,7 +201,8 @@ def _of_scene(file: str, on_it: tuple[float, float, float], plane: Plane | None 
 
 
 def _playbot(name: str) -> Body:
-    """Read the robot without its tile; the support plane is that of its own base, because it hovers above the tile."""
+    """Read the robot without its tile. The robot hovers above the tile, so the support plane is the plane of its own
+    base."""
     cloud = read_capture(data_folder() / "scenes" / "playbot", device="cpu").cloud
     tile = Plane(np.array([0.0, -1.0, 0.0]), -0.019)
     above = cloud.subset(tile.heights(cloud.means.numpy()) > 0.13)

@@ -1,11 +1,11 @@
-"""Size of a bundle beside those of numbered .ply, .sog and .spz and of one USD stage, for finished runs.
+"""Sizes of a bundle, of numbered .ply, .sog and .spz files, and of one USD stage, for finished runs.
 
-Numbered files of a run differ little in size: three of them are written, and their mean is multiplied by the number of
-frames. A USD stage grows by the same amount with each frame: two stages with few frames are written, and the difference
-is multiplied. Bundles are written completely.
+The numbered files of a run differ little in size, so three of them are written, and their mean size is multiplied by
+the number of frames. A USD stage grows by the same size with each frame, so two stages with few frames are written, and
+the difference of their sizes is multiplied. Bundles are written completely.
 
-Aims: ``fiftieth_of_sog`` (every bundle takes at most 1/50 of numbered .sog), ``second_is_a_fiftieth`` (so does each
-second by which a film is longer).
+Aims: ``fiftieth_of_sog`` (every bundle takes at most 1/50 of the size of numbered .sog files), ``second_is_a_fiftieth``
+(each additional second of film takes at most 1/50, too).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FORMATS = (*NUMBERED, "usd", "bundle")
 
 
 def numbered_size(run: FinishedRun, kind: str, folder: Path) -> float:
-    """Return the bytes of all frames of ``run`` in numbered files, from those of three."""
+    """Return the size of all frames of ``run`` in numbered files, bytes, computed from three files."""
     count = len(run.steps)
     sizes = []
     for frame in (0, count // 2, count - 1):
@@ -43,7 +43,7 @@ def numbered_size(run: FinishedRun, kind: str, folder: Path) -> float:
 
 
 def stage_size(run: FinishedRun, folder: Path) -> float:
-    """Return the bytes of a USD stage with all frames of ``run``, from those of two shorter stages."""
+    """Return the size of a USD stage with all frames of ``run``, bytes, computed from two shorter stages."""
     count = len(run.steps)
     numbers, sizes = [], []
     for every in (count // 2, count // 5):

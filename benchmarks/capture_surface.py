@@ -1,4 +1,4 @@
-"""Triangle surface of a capture as in SuGaR: a level set of the density of its Gaussians."""
+"""Triangle surface of a capture as in SuGaR: a level set of the Gaussians' density."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from egs_warp.deformation.baselines import BoundSurface
 from egs_warp.geometry.gaussians import GaussianCloud
 
 LEVEL = 0.3
-"""Density at SuGaR's level set; the density is the sum of the Gaussians, each multiplied by its opacity."""
+"""Density at SuGaR's level set. The density is the sum of the Gaussians, each multiplied by its opacity."""
 CELLS = 128
 """Number of lattice cells along the longest side."""
 REACH = 3.0
@@ -20,8 +20,8 @@ REACH = 3.0
 def capture_surface(cloud: GaussianCloud) -> BoundSurface:
     """Extract the surface of a capture by marching cubes on its density.
 
-    SuGaR solves Poisson's equation for points of the same level set instead. A scale below half a cell is raised to
-    half a cell, because the lattice would otherwise miss the Gaussian.
+    SuGaR applies Poisson reconstruction to points of the same level set instead. A standard deviation below half a cell
+    is raised to half a cell, because the lattice would otherwise miss the Gaussian.
     """
     means = cloud.means.numpy().astype(np.float64)
     opacities = cloud.opacities()

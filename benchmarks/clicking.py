@@ -21,17 +21,17 @@ from egs_warp.segmentation.object_spec import ObjectSpec
 from harness import timed
 
 CLICKED, JUDGED = slice(0, None, 2), slice(1, None, 2)
-"""Views of a scene whose outlines may be used for clicks, and views whose outlines judge the result."""
+"""Views of a scene whose outlines may be used for clicks, and views whose outlines are used to evaluate the result."""
 VISIBLE = 0.01
-"""Minimum depth of a region of wrong pixels (largest distance from its edge), relative to the image's shorter side; no
-click is made on a shallower region."""
+"""Minimum depth of a region of wrong pixels, which is the largest distance of its pixels from its edge, relative to the
+image's shorter side. No click is made on a shallower region."""
 
 
 def overlap(cloud: GaussianCloud, object_cloud: GaussianCloud, view: DrawnView) -> tuple[float, np.ndarray, np.ndarray]:
     """Compare ``object_cloud``, rendered alone, with the outline of a view.
 
-    Pixels at which neither ``cloud``, the whole scene, nor the object is opaque, and those at which something hides the
-    object are ignored.
+    Pixels are ignored where neither ``cloud``, the whole scene, nor the object is opaque, and where something hides the
+    object.
 
     Returns:
         IoU; (H, W) bool, pixels inside the outline that the object lacks; (H, W) bool, pixels of the object outside the
@@ -47,7 +47,8 @@ def overlap(cloud: GaussianCloud, object_cloud: GaussianCloud, view: DrawnView) 
 
 
 def innermost(mask: np.ndarray) -> tuple[float, tuple[float, float]]:
-    """Return the largest distance of a pixel in ``mask`` (H, W) from the mask's edge, pixels, and its (u, v)."""
+    """Return the largest distance of a pixel in ``mask`` (H, W) from the mask's edge, pixels, and the position (u, v)
+    of that pixel."""
     depth = depth_inside(np.pad(mask, 1))[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
     return float(depth[row, column]), (column + 0.5, row + 0.5)
@@ -73,7 +74,7 @@ def found_by(
 def clicked(
     annotated: DrawnScene, cloud: GaussianCloud, cameras: Sequence[Camera], count: int
 ) -> tuple[ObjectSpec, list[str]]:
-    """Simulate a user who makes ``count`` clicks, each on the largest error that the previous clicks have left.
+    """Simulate a user who makes ``count`` clicks, each on the largest remaining error.
 
     Returns:
         the object's description, and the clicks in the notation of the command line.
@@ -90,7 +91,7 @@ def clicked(
             try:
                 object_cloud = found_by(cloud, spec, cameras, {})[1]
             except UserError as error:
-                # A user would see a one-line error and, without any object so far, would click on the object again.
+                # A user would see a one-line error and, if there is no object yet, would click on the object again.
                 print(f"{annotated.name}: {number} clicks: {error}")
             if object_cloud is not None:
                 _, missing, more = overlap(cloud, object_cloud, view)
@@ -106,8 +107,8 @@ def clicked(
 
 
 def picture(object_cloud: GaussianCloud, view: DrawnView, missing: np.ndarray, more: np.ndarray) -> np.ndarray:
-    """Return the image (320, 320, 3) uint8 of the object alone, red where it is missing, blue where it extends beyond
-    the outline."""
+    """Return the image (320, 320, 3) uint8 of the object alone, red where a part is missing, blue where the object
+    extends beyond the outline."""
     rendered = render_gaussians(object_cloud, view.camera, background=(0.7, 0.7, 0.7)).colour.numpy()
     picture = np.clip(rendered.astype(np.float32), 0.0, 1.0)
     picture[missing], picture[more] = (1.0, 0.1, 0.1), (0.1, 0.2, 1.0)

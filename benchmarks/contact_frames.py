@@ -1,4 +1,5 @@
-"""Input of the solver benchmarks: the steps of an animation with known activations, each as a Coulomb program."""
+"""Input of the solver benchmarks: the steps of an animation with known activations, each as a QP with Coulomb
+contact."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ from egs_warp.segmentation.base_plane import find_base_plane
 from harness import data_folder
 
 CAPTURES = {"monkey": ("monkey.ply", (0.0, 1.0, 0.0)), "plush dog": ("plush_dog.ply", (0.0, -1.0, 0.0))}
-"""File and up direction of the real captures in the data folder."""
+"""File in the data folder, and up direction, of the real captures."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +132,8 @@ def animation_frames(
 ) -> list[Frame]:
     """Simulate an animation with known activations of muscle groups and exact contact at a few points.
 
-    The objectives of a step are the animation's own values at its end: the velocity of the centre of mass, the angular
-    momentum and the node velocities. The engine's planner builds the program of each step.
+    The targets of a step's objectives are the animation's own values at the end of the step: the velocity of the centre
+    of mass, the angular momentum and the node velocities. The engine's planner builds the program of each step.
 
     Raises:
         RuntimeError: a step did not converge.
@@ -142,7 +143,7 @@ def animation_frames(
     synergies = grouped_segments(muscles, body.mesh.nodes, activations, seed)
     steps = make_step_linearizer(stepper.linearizer, muscles, synergies)
     stepper.planner = replace(stepper.planner, synergies=synergies, linear_steps=steps)
-    # Only the chosen points are in contact, however deeply others penetrate.
+    # Only the chosen points are in contact, even if others penetrate the ground.
     stepper.solver = replace(stepper.solver, penetration_tolerance=np.inf)
     points = spread_points(bench, contacts)
     known = known_activations(activations, frames, strength, seed)

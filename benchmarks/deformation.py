@@ -1,7 +1,8 @@
-"""Cost of deforming a million Gaussians with colours of degree 3 (seven points, covariance, SVD, SH rotation).
+"""Cost of deforming a million Gaussians with colours of degree 3: seven points, covariance, SVD and SH rotation of
+each.
 
-Aims: ``cuda_within_2x_copy`` (on a GPU, at most twice the time of copying as many bytes), ``cpu_5x_twin`` (on a CPU,
-at least 5 times as fast as vectorised PyTorch on the same number of threads).
+Aims: ``cuda_within_2x_copy`` (on a GPU, at most twice the time of copying the same number of bytes), ``cpu_5x_twin``
+(on a CPU, at least 5 times as fast as vectorised PyTorch on the same number of threads).
 """
 
 from __future__ import annotations
@@ -25,10 +26,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BYTES_READ = 12 + 16 + 12 + 4
-"""Bytes of a Gaussian's mean, rotation, scales and tetrahedron; the deformed cage stays in cache and is not counted."""
+"""Bytes of a Gaussian's mean, rotation, scales and tetrahedron. The deformed cage stays in the cache and is not
+counted."""
 BYTES_READ_ACROSS = 6 * (4 + 4) + 3 * 4
-"""Further bytes of a Gaussian that extends into several tetrahedra: tetrahedron and share of each arm, weight of each
-axis."""
+"""Additional bytes of a Gaussian that extends into several tetrahedra: tetrahedron and inside fraction of each arm, and
+smoothing length of each axis."""
 BYTES_WRITTEN = 12 + 16 + 12 + 16
 """Bytes of a Gaussian's deformed mean, rotation and scales and of its colour rotation."""
 BYTES_OF_COLOUR = 192 + 192
@@ -36,7 +38,7 @@ BYTES_OF_COLOUR = 192 + 192
 
 
 def random_cloud(count: int, seed: int, device: str) -> GaussianCloud:
-    """Gaussians of many sizes in the unit cube; the larger ones extend into several tetrahedra."""
+    """Return random Gaussians of many sizes in the unit cube; the larger ones extend into several tetrahedra."""
     rng = np.random.default_rng(seed)
     return GaussianCloud.from_numpy(
         rng.uniform(0.0, 1.0, (count, 3)),
@@ -74,7 +76,7 @@ def _basis_3(d: torch.Tensor) -> torch.Tensor:
 
 
 class TorchTwin:
-    """The deformation of ``Deformer`` in vectorised PyTorch, on whole arrays."""
+    """The deformation of ``Deformer`` in PyTorch, vectorised over whole arrays."""
 
     def __init__(self, cloud: GaussianCloud, embedding: GaussianEmbedding) -> None:
         points = embedding.points
@@ -116,7 +118,7 @@ class TorchTwin:
         back = self.directions @ turn
         colour[:, 4:9] = self.from_values_2 @ (_basis_2(back[:, :5]) @ self.sh[:, 4:9])
         colour[:, 9:16] = self.from_values_3 @ (_basis_3(back) @ self.sh[:, 9:16])
-        # PyTorch sorts the singular values in descending order; the engine keeps the order of the axes.
+        # PyTorch sorts the singular values in descending order; the engine preserves the order of the axes.
         return mean.float(), frame, scales, colour
 
 
@@ -150,12 +152,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     bytes_moved = count * (BYTES_READ + BYTES_WRITTEN + BYTES_OF_COLOUR) + across * BYTES_READ_ACROSS
     source = wp.zeros(bytes_moved // 32, dtype=wp.vec4, device=device)
     target = wp.empty_like(source)
-    # The copy reads half of the bytes and writes the other half, so it moves as many as the deformation. The faster of
-    # two copies counts.
+    # The copy reads and writes half of the bytes each, so it moves the same number of bytes as the deformation. The
+    # faster of two copies is used.
     calls["copy"] = lambda: wp.copy(target, source)
     calls["copy_kernel"] = lambda: wp.launch(copy_kernel, len(source), inputs=[source], outputs=[target], device=device)
     if device.is_cuda:
-        # A launch costs the host 20 us; graphs measure the device alone.
+        # A launch takes 20 us on the host; with graphs, only the time on the device is measured.
         for name in ("deform", "copy", "copy_kernel"):
             calls[name]()
             with wp.ScopedCapture(device=device) as capture:

@@ -1,4 +1,4 @@
-"""A soft body dropped on the floor: the simulated deformation of the fall in Table 1."""
+"""A soft body dropped on the floor: the simulated deformation "fall" of Table 1."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ TIME_STEP = 1.0 / 120.0
 """Step size, s."""
 
 NEAREST = 12
-"""Number of nodes to which the displacement of a point is fitted."""
+"""Number of nodes from which the displacement of a point is fitted."""
 
 
 @dataclass(frozen=True)
 class Drop:
-    """A recorded fall."""
+    """A recorded fall of a soft body."""
 
     frames: np.ndarray
     """(F, N, 3) m, node positions at every step."""
@@ -38,10 +38,10 @@ class Drop:
     """(N, 3) m, nodes at rest."""
 
     def at_impact(self, points: np.ndarray) -> np.ndarray:
-        """Return ``points`` (P, 3) of the rest shape, deformed as in the frame of largest elastic energy.
+        """Return ``points`` (P, 3) of the rest shape, deformed as in the frame with the largest elastic energy.
 
-        The deformation at a point is the affine map that best fits the nearest nodes, with weights that fall smoothly
-        to zero (moving least squares). It extrapolates where a coarse cage does not cover a point.
+        The deformation at a point is the affine map that best fits the nearest nodes, with weights that decay smoothly
+        to zero (moving least squares). It extrapolates to points that a coarse cage does not cover.
         """
         count = min(NEAREST, len(self.rest))
         distance, near = (np.asarray(result) for result in KDTree(self.rest).query(points, k=count))

@@ -4,11 +4,12 @@ python benchmarks/effort.py [--quick] [--workers 2] [--device cpu] [--seed 0] [-
 
 Every body of the sweep performs every motion with default settings. Energies are in m g H, loads in body weights. Work
 is the sum over segments and steps of the work that muscles do while they shorten. A reversal is a step in which the
-ground's normal load changes in the opposite direction to the step before, by more than 0.02 body weights in both; only
-steps before lift-off are counted, or all steps if the body never lifts off. Aims, for the standard jump of every body:
-``work`` (at most 1.5), ``internal_energy`` (kinetic energy of deformation at most 0.25),
-``chatter`` (reversals in at most 15 % of steps, none above 0.3 body weights); for every run: ``ledger_closes`` (energy
-balance to 1e-6 a step).
+change of the ground's normal load has the opposite sign to the change in the previous step, both by more than 0.02 body
+weights; only steps before lift-off are counted, or all steps if the body never lifts off.
+
+Aims, for the standard jump of every body: ``work`` (at most 1.5), ``internal_energy`` (kinetic energy of deformation at
+most 0.25), ``chatter`` (reversals in at most 15 % of steps, none above 0.3 body weights); for every run:
+``ledger_closes`` (the error of the energy balance is at most 1e-6 per step).
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ BODIES = ("pawn", "figurine", "stool", "robot", "monkey")
 MOTIONS = ("jump", "hop 0.7 0.3 x2", "twist 90", "walk 0.4", "turn 30", "stand 2")
 MAX_WORK, MAX_INTERNAL, MAX_REVERSED, MAX_REVERSAL, BALANCE_TOLERANCE = 1.5, 0.25, 0.15, 0.3, 1e-6
 MIN_CHANGE = 0.02
-"""Minimum change of the load that counts, body weights."""
+"""Minimum change of the load in a reversal, body weights."""
 
 
 def load(trajectory: Trajectory) -> np.ndarray:
@@ -51,7 +52,7 @@ def load(trajectory: Trajectory) -> np.ndarray:
 
 
 def before_lift_off(loads: np.ndarray) -> int:
-    """Return the number of steps before the longest flight; all steps if no flight lasts three steps."""
+    """Return the number of steps before the longest flight phase; all steps if no flight phase lasts three steps."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], loads <= 0.0, [0]])))
     starts, ends = edges[::2], edges[1::2]
     longest = int(np.argmax(ends - starts)) if len(starts) else 0
@@ -59,9 +60,9 @@ def before_lift_off(loads: np.ndarray) -> int:
 
 
 def reversals(loads: np.ndarray) -> np.ndarray:
-    """Return the reversal of the load (F-2,) at each inner step, body weights.
+    """Return the size of the reversal of the load (F-2,) at each inner step, body weights.
 
-    A reversal is the smaller of two consecutive changes of opposite sign; 0 if the signs agree.
+    It is the smaller of two consecutive changes with opposite signs; 0 if the signs agree.
     """
     changes = np.diff(loads)
     turned = changes[1:] * changes[:-1] < 0.0
@@ -69,7 +70,8 @@ def reversals(loads: np.ndarray) -> np.ndarray:
 
 
 def run(body: str, name: str, *, device: str, seed: int, frames: int | None = None) -> Row:
-    """Simulate one motion of one body and return its row; ``stopped`` is the reason if the motion failed."""
+    """Simulate one motion of one body and return its row. The entry ``stopped`` contains the reason if the motion
+    failed."""
     judged, milliseconds = timed(_run, body, name, device=device, seed=seed, frames=frames)
     return {"body": body, "motion": name, **judged, "seconds": 1e-3 * milliseconds}
 

@@ -75,7 +75,8 @@ def row_of(name: str, summary: Row, contacts: np.ndarray) -> Row:
 
 
 def stages_of(rows: list[Row]) -> list[str]:
-    """Return the stages that occur in at least one example; replanning, for example, does not occur in all of them."""
+    """Return the stages that occur in at least one example. Some stages, such as replanning, do not occur in all
+    examples."""
     return list(dict.fromkeys(stage for row in rows for stage in row["milliseconds"]))
 
 

@@ -1,11 +1,12 @@
 """Error of the front that ``egs-warp`` guesses, for nineteen bodies and the stool.
 
-The truth of the first eleven bodies was written down from images of each body from eight sides before the guess was
-first run on them. It was judged by eye, to about 15 degrees. For the fox, whose head is turned, it is the front of its
-body. The truth of the modelled bodies is the side of their head and toes. The guess's weights were chosen on these
-bodies, so they are not held out. ``--plot`` draws each body from its guessed front. Aims: ``right_14_of_15`` (at least
-14 of 15 guesses are within 30 degrees of the truth; the stool does not count) and ``wrong_is_unclear`` (for each wrong
-guess, the message names an alternative).
+The true front of the first eleven bodies was written down before the guess was first run on them, from images of each
+body from eight sides. It was judged by eye, to about 15 degrees. For the fox, whose head is turned, it is the front of
+its trunk. The true front of the modelled bodies is the side of their head and toes. The guess's weights were chosen on
+these bodies, so the bodies are not held out. ``--plot`` draws each body from its guessed front.
+
+Aims: ``right_14_of_15`` (at least 14 of 15 guesses are within 30 degrees of the truth; the stool is not counted) and
+``wrong_is_unclear`` (for each wrong guess, the message names an alternative).
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ TRUTH = {
     "figurine": (0.0, -1.0, 0.0),
     "stool": (0.0, -1.0, 0.0),
 }
-"""True front of each body in the axes of its capture; meshes are rotated to z up."""
+"""True front of each body in the axes of its capture; for meshes, in their axes after the rotation to z up."""
 MAX_ERROR = 30.0
 """Maximum error, degrees."""
 MIN_BODIES, MIN_RIGHT_FRACTION = 15, 14 / 15

@@ -1,16 +1,16 @@
 """Figure 7: an object segmented from a real scene, by four methods side by side.
 
-``hard assignment`` is what Gaussian Grouping does: each Gaussian belongs to the group that most of its pixels show. It
-belongs to the object if more than half of its blending weight lies in the object's masks of 18 views; the plane is not
-used.
-The other methods are those of Table 3: Gaussians that straddle the plane are removed (``remove``), cut at the plane
-(``static split``), or trained until they are clear of it (``L_seg``).
+``hard assignment`` is the method of Gaussian Grouping: each Gaussian belongs to the group that most of its pixels show.
+It belongs to the object if more than half of its blending weight lies in the object's masks of 18 views; the plane is
+not used. The other methods are those of Table 3: Gaussians that straddle the plane are removed (``remove``), cut at the
+plane (``static split``), or trained until they are clear of it (``L_seg``).
 
-The measure is that of Table 3, with cameras in the plane: the residual is the sum of the pixels below the plane
+The measure is the same as in Table 3, with cameras in the plane: the residual is the sum of the pixels below the plane
 divided by the sum above it; PSNR and SSIM compare the upper half with the hard assignment, which contains everything
 that the masks show. Aim: ``figure7_best``: in every scene L_seg has a residual of at most 0.002, as in the paper, and
-no other method with so small a residual has a higher PSNR of the upper half. ``whole dB``, which has no aim, combines
-both: the PSNR of the whole image, whose target is the hard assignment's upper half above an empty lower half.
+no other method with a residual of at most 0.002 has a higher PSNR of the upper half. ``whole dB``, which has no aim,
+combines both: it is the PSNR of the whole image, whose target is the hard assignment's upper half above an empty lower
+half.
 
 The image (``--plot``) has one row for each scene, seen from just above the plane at the object's foot: the whole
 scene, then the four methods.
@@ -84,7 +84,7 @@ def judge(rows: Sequence[Row], missing: Sequence[str]) -> tuple[dict[str, bool |
     verdicts = []
     for name in {row["scene"] for row in rows}:
         clean = {r["method"]: r for r in rows if r["scene"] == name and r["residual"] <= MAX_RESIDUAL}
-        # The hard assignment is the target of the PSNR, so its own PSNR is infinite; it must fail by its residual.
+        # The hard assignment is the target of the PSNR, so its own PSNR is infinite; its residual must fail the aim.
         verdicts.append(
             OURS in clean and HARD not in clean and all(clean[OURS]["psnr"] >= row["psnr"] for row in clean.values())
         )

@@ -1,8 +1,8 @@
 """Time from opening a page to its first image with splats, for the page of ``view`` and for ``<egs-player>``.
 
-Each page is opened several times in a new context of Chromium, which has nothing of it in a cache, in a window of
-640 x 480 pixels. The time begins with the navigation and ends when the splats are sorted and drawn. The files are on
-this machine. Chromium without a GPU renders in software.
+Each page is opened several times, in a window of 640 x 480 pixels and in a new context of Chromium with an empty cache.
+The time begins with the navigation and ends when the splats are sorted and drawn. The files are on this machine.
+Chromium without a GPU renders in software.
 
 Aim: ``two_seconds`` (the median of each page is at most 2 s). Set EGS_WARP_BROWSER if Chromium has another name.
 """

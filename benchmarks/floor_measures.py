@@ -1,6 +1,6 @@
-"""Similarity of an inpainted hole to the true floor: per pixel, after a blur, and in its detail.
+"""Similarity of an inpainted hole to the true floor: per pixel, after a blur, and by the energy of its gradients.
 
-The self-similarity of the true floor bounds the score of any inpainting with sharp texture.
+The self-similarity of the true floor is an upper bound for the score of any inpainting with sharp texture.
 """
 
 from __future__ import annotations
@@ -46,9 +46,11 @@ def coarse_psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float
 
 
 def gradient_energy(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Return the mean squared gradient of ``image`` in ``mask`` (H, W), divided by that of ``truth``.
+    """Return the mean squared gradient of ``image`` in ``mask`` (H, W), divided by the mean squared gradient of
+    ``truth``.
 
-    The seam, a rim of three pixels, is left out. Below 1 the image is too smooth, above 1 too busy.
+    A rim of three pixels, the seam, is excluded. Values below 1 mean that the image is too smooth, above 1 that it has
+    too much detail.
     """
     inner = np.asarray(ndimage.binary_erosion(mask, iterations=3), dtype=bool)
 
@@ -60,7 +62,8 @@ def gradient_energy(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> f
 
 
 def moved_floor_scores(truth: np.ndarray, known: np.ndarray, hole: np.ndarray) -> list[tuple[float, float]]:
-    """Score copies of the true floor, taken half a side to a full side of the hole away, in place of an inpainting.
+    """Score shifted copies of the true floor, from half a side to a full side of the hole away, in place of an
+    inpainting.
 
     Args:
         truth: (rows, columns, 3) colours of the floor.

@@ -1,15 +1,16 @@
-"""Cost of a step by stage, as a function of the number of nodes of the cage and of contacts of the step.
+"""Cost of a step by stage, as a function of the numbers of cage nodes and of contacts.
 
 python benchmarks/frame.py [--quick] [--nodes N ...] [--frames N] [--old FOLDER] [--json PATH] [--plot PATH]
 
-The pawn jumps with cages of about 250 to 4,000 nodes; for each of the first steps, the times of its stages and its
+The pawn jumps with cages of about 250 to 4,000 nodes. For each of the first steps, the times of its stages and its
 numbers of nodes and contacts are recorded. The model t = c nodes^p contacts^q is fitted to all records of a stage
-(steps with contact, least squares of the logarithms). ``--old`` is a checkout of commit 3848750. The jump example of
-that commit is timed in the same run; the jumps of the available captures (plush dog, monkey, robot) are timed with both
-versions, each with its own number of nodes. Run the benchmark on two idle cores (``taskset -c 0,1``).
+(steps with contact, least squares of the logarithms). ``--old`` is the folder of a checkout of commit 3848750. The jump
+example of that commit is timed in the same run, and the jumps of the available captures (plush dog, monkey, robot) are
+timed with both versions, each with its own number of nodes. Run the benchmark on two idle cores (``taskset -c 0,1``).
 
-On a GPU the jump is timed once more with 1,000,000 Gaussians on about 1,000 nodes, if ``--nodes`` includes that cage:
-each step, then its image of 1920 x 1080, which is rendered during the next step and downloaded after it.
+On a GPU the jump is timed once more with 1,000,000 Gaussians on about 1,000 nodes, if ``--nodes`` includes that cage.
+Each frame consists of a step and its image of 1920 x 1080, which is rendered during the next step and downloaded after
+it.
 
 Aims on a CPU: ``cpu_541`` (mean at most 60 ms, worst step at most 5 times the mean), ``cpu_10x`` (at most a tenth of
 the old commit's time, for the pawn and each capture), ``cpu_250_realtime`` (mean at most 16.7 ms). On a GPU:
@@ -60,7 +61,7 @@ _PICTURELESS = ("--no-shadow", "--size", "64")
 
 
 GAUSSIANS, SIZE = 1_000_000, (1920, 1080)
-"""Gaussians and image size of the frames that are rendered during the steps."""
+"""Number of Gaussians and image size of the frames that are rendered during the steps."""
 
 
 def measure(nodes_requested: int, frames: int, *, device: str, seed: int) -> list[Row]:
@@ -182,7 +183,7 @@ def exponents(records: list[Row]) -> dict[str, list[float]]:
 
 
 def old_step(folder: Path, frames: int, *capture: str) -> float:
-    """Return the ms per step of a jump with the code in ``folder``, from its report.
+    """Return the time per step of a jump with the code in ``folder``, ms, read from its report.
 
     Args:
         folder: checkout of the old commit.
@@ -199,7 +200,7 @@ def old_step(folder: Path, frames: int, *capture: str) -> float:
 
 
 def old_captures(folder: Path, frames: int, *, device: str) -> list[Row]:
-    """Time the available captures with the code in ``folder`` and with this code."""
+    """Time the jumps of the available captures with the code in ``folder`` and with this code."""
     rows: list[Row] = []
     for name, (file, up) in CAPTURES.items():
         path = data_folder().resolve() / "objects" / file

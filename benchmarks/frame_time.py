@@ -1,10 +1,10 @@
-"""Cost of a film's frame by stage: deforming the Gaussians, shadow on the floor, rendering, and download for the video.
+"""Cost of a film's frame by stage: deforming the Gaussians, floor shadow, rendering, and download for the video.
 
 python benchmarks/frame_time.py [--quick] [--device cuda:0] [--seed 0] [--json PATH] [--plot PATH]
 
-The pawn, in a cage of about 1,000 nodes, bends back and forth. Stages are timed one by one; the whole is timed without
-synchronisation between them. Aim: ``picture_60hz`` (1,000,000 Gaussians at 1920 x 1080 within 16.7 ms; null on a CPU).
-Encoding and the solver's step are not included.
+The pawn, in a cage of about 1,000 nodes, bends back and forth. Each stage is timed separately; the whole frame is timed
+without synchronisation between the stages. Aim: ``picture_60hz`` (1,000,000 Gaussians at 1920 x 1080 within 16.7 ms;
+null on a CPU). Encoding and the solver's step are not included.
 """
 
 from __future__ import annotations

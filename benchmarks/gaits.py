@@ -4,17 +4,17 @@ python benchmarks/gaits.py [--quick] [--workers 2] [--nodes 500] [--bodies NAME 
     [--captures FOLDER] [--json PATH] [--join PATH]
 
 A cell is one body with one motion. A walk succeeds if it ends upright within 0.1 body heights and 10 degrees of the
-target, within 60 sqrt(H/g); a twist if it ends within 10 degrees after at most two jumps; a standard jump if it is
-within 15 % of the requested height and distance. A body that stands and is pushed by 0.1 m sqrt(g H) from the side
-succeeds if it ends upright and no sole was ever more than 0.1 body heights from its initial position. A body that is
-pushed by 1 m sqrt(g H) at 0.8 of its height succeeds if it stands at the end, possibly after getting up. Slip is the
-displacement of a foot while it is on the ground, divided by the stride; cost of transport is the
-muscles' work divided by m g times the distance.
+target, within 60 sqrt(H/g); a twist succeeds if it ends within 10 degrees after at most two jumps; a standard jump
+succeeds if its height and distance are within 15 % of the request. A body that stands and is pushed by 0.1 m sqrt(g H)
+from the side succeeds if it ends upright and no sole was ever more than 0.1 body heights from its initial position. A
+body that is pushed by 1 m sqrt(g H) at 0.8 of its height succeeds if it stands at the end, possibly after getting up.
+Slip is the displacement of a foot while it is on the ground, divided by the stride. Cost of transport is the muscles'
+work divided by m g times the distance.
 
-A motion that is refused with an error counts as a failure; getting up is counted separately and has no aim. A ball
-is judged by its position and, if it does not roll, by its heading. Captures are used if they are on this machine.
-``--unseen`` runs five bodies that were not used while the motions were developed, ``--captures`` those of a folder
-written by ``trained_bodies.py``.
+A motion that is rejected with an error is counted as a failure; getting up is counted separately and has no aim. A ball
+is judged by its position and, if it does not roll, by its heading. Captures are included if they are available on this
+machine. ``--unseen`` runs five bodies that were not used during the development of the motions, ``--captures`` runs the
+bodies of a folder written by ``trained_bodies.py``.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> 
     own = done.motion.outcome_record(trajectory, 0, len(trajectory.time) - 1)
     reached: dict[str, Any] = asdict(measure(trajectory)) | (asdict(own) if own is not None else {})
     if stands is SupportKind.ROUND_BASE:
-        # A ball has no upright pose, and has a heading only while it does not roll.
+        # A ball has no upright pose, and its heading is defined only while it does not roll.
         reached["tilt_degrees"] = 0.0
         moved[2] = moved[2] if cell in ("turn", "twist") else 0.0
     checked = asdict(audit(trajectory, newton_unconverged=sum(not r.converged for r in performance.simulation.reports)))
@@ -137,7 +137,7 @@ def _body(name: str, captures: Path | None) -> Body:
 
 
 def creature_of(one: Body, nodes: int) -> Creature:
-    """Build the creature, with a cage of ``nodes`` nodes or, if none can be built, of twice as many."""
+    """Build the creature with a cage of ``nodes`` nodes or, if no such cage can be built, of twice as many."""
     try:
         return make_creature(one.cloud, plane=one.plane, options=CreatureOptions(nodes=nodes))
     except ArgumentError:
@@ -145,7 +145,8 @@ def creature_of(one: Body, nodes: int) -> Creature:
 
 
 def _moved(performance: SimulatedRun) -> np.ndarray:
-    """Return (3,), displacement of the centre of mass ahead and to the left, body heights, and rotation, degrees."""
+    """Return (3,), the displacement of the centre of mass ahead and to the left, body heights, and the rotation,
+    degrees."""
     trajectory, place, body_ = performance.trajectory, performance.place, performance.creature.body
     first, last = (body_.centre_of_mass(place.ground.local(trajectory.positions[k])) for k in (0, -1))
     return np.array([*((last - first)[:2] / body_.height), measure(trajectory).heading_degrees])
@@ -182,7 +183,7 @@ def _push_failure(reached: dict[str, Any]) -> str | None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the cells."""
+    """Run the cells and print the table."""
     parser = flags(__doc__, quick="three bodies, short distances", device="cpu")
     workers_flag(parser)
     parser.add_argument("--nodes", type=int, default=500, help="approximate number of nodes of the cages")
@@ -228,7 +229,7 @@ def summary(rows: list[Row], *, whole: bool) -> dict[str, Any]:
     fell = [row for row in rows if row.get("tilt_degrees", 0.0) > 60.0]
     pushed = [row["success"] for row in rows if row["cell"] == "push"]
     bodies = {row["body"] for row in rows}
-    # The held-out bodies are judged by themselves.
+    # The held-out bodies are judged separately.
     is_complete = whole and (len(bodies) >= 14 or bodies == set(UNSEEN))
     why = "" if is_complete else "not all cells of 14 bodies, or of the unseen ones, were run"
     aims = {

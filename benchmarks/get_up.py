@@ -3,7 +3,8 @@
 python benchmarks/get_up.py [--quick] [--workers 2] [--nodes 150] [--bodies NAME ...] [--json PATH]
 
 A body starts at rest, lying just above the ground, with the motion ``get up``. It succeeds if it ends at rest within 15
-degrees of upright. Work is the muscles' work over all tries, in m g H; time counts from the start, in sqrt(H/g).
+degrees of upright. Work is the muscles' work over all attempts, in m g H. Times are measured from the start, in
+sqrt(H/g).
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ def _run(name: str, degrees: float, side: str, nodes: int) -> Row:
 
 
 def summary(rows: list[Row]) -> dict[str, Any]:
-    """Return the aims from the rows so far."""
+    """Return the aims, computed from the rows that are available so far."""
     works = [row["work"] for row in rows if row["up"]]
     is_complete = {row["body"] for row in rows} >= set(BODIES)
     aims = {
@@ -94,7 +95,7 @@ def summary(rows: list[Row]) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the cells."""
+    """Run the cells and print the table."""
     parser = flags(__doc__, quick="three bodies, tilted by 90 degrees", device="cpu")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--nodes", type=int, default=150, help="approximate number of nodes of the cages")

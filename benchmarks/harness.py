@@ -1,9 +1,9 @@
 """Shared parts of all benchmarks: flags, the data folder, timing, the printed table, and the JSON and image output.
 
-A benchmark takes ``--quick`` (under ten minutes on two cores), ``--device``, ``--seed``, ``--json PATH`` and
-``--plot PATH``, prints a table, and writes JSON with ``rows`` (the figures), ``environment`` (device, versions and
-settings of the measurement), ``aims`` (true or false according to the rows, or null if not measured) and ``why_null``
-(the reason for each null).
+A benchmark takes ``--quick`` (under ten minutes on two cores), ``--device``, ``--seed``, ``--json PATH`` and ``--plot
+PATH``. It prints a table and writes JSON with ``rows`` (the results), ``environment`` (device, versions and settings of
+the measurement), ``aims`` (true or false, computed from the rows, or null if not measured) and ``why_null`` (the reason
+for each null).
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def rows_of(run: Callable[..., Row], tasks: Sequence[tuple[Any, ...]], workers: 
     A task whose process dies is repeated.
 
     Raises:
-        RuntimeError: tasks failed; raised after all others are completed.
+        RuntimeError: tasks failed; raised after all other tasks are completed.
     """
     failed = []
     for ended in map_tasks(_Run(run), tasks, workers=workers):
@@ -96,7 +96,8 @@ class _Run:
 
 
 def data_folder() -> Path:
-    """Return the folder of captures, meshes and points: $EGS_WARP_DATA, else the default next to the repository."""
+    """Return the folder of captures, meshes and points: $EGS_WARP_DATA, or the default folder next to the
+    repository."""
     return Path(os.environ.get("EGS_WARP_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
 
@@ -114,7 +115,8 @@ def median_ms(
     synchronise: Callable[[], Any] = lambda: None,
     warm_up: int = 3,
 ) -> dict[str, float]:
-    """Return the median milliseconds of each call; calls alternate, so that drift of the machine affects all alike."""
+    """Return the median time of each call, ms. The calls alternate, so that a drift of the machine's speed affects all
+    of them."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     for turn in range(repeats + warm_up):
         for name, call in calls.items():
@@ -131,7 +133,8 @@ class Table:
     """Text table under one header; each row is printed at once."""
 
     def __init__(self, **columns: str) -> None:
-        """Print the header; each heading has a format such as ``8.2f`` or ``<12`` (``_`` is printed as a space)."""
+        """Print the header. The value of each column is its format, such as ``8.2f`` or ``<12``; ``_`` is printed as a
+        space."""
         self._formats = list(columns.values())
         names = [name.replace("_", " ") for name in columns]
         self._widths = [
@@ -221,7 +224,7 @@ def report(
 
     Args:
         draw: function that draws into an empty figure of ``size`` inches.
-        picture: (H, W, 3) image that is written instead of a drawing, uint8 or floats from 0 to 1.
+        picture: (H, W, 3) image, uint8 or floats from 0 to 1, that is written in place of a drawing.
     """
     result_record = record(options, rows, **result)
     print(json.dumps({name: result_record[name] for name in ("aims", "why_null")}, indent=1))

@@ -1,20 +1,22 @@
 """Inpainting of the floor under an object, compared with the known floor.
 
-Cases: the three built-in scenes (the floor under the object is removed and replaced by dark haze, as in a capture) and
+Cases: the three built-in scenes (the floor under the object is removed and replaced by dark haze, as in a capture), and
 holes cut into visible floor of real captures. In held-out views, the hole's pixels are compared with the original
-floor. Rows: this package; the same with ``cv2.inpaint`` on the plane seen face-on in place of patch synthesis (same
-flat Gaussians, same training); ``cv2.inpaint`` in every image (the better of its two methods, both times); training
-without the plane: the same number of Gaussians, scattered where the object stood, against the same single inpainted
-image.
+floor.
+
+Rows: this package; the same with ``cv2.inpaint`` on the face-on view of the plane in place of patch synthesis (same
+flat Gaussians, same training); ``cv2.inpaint`` in every image (the better of its two methods, but the time of both);
+and training without the plane, in which the same number of Gaussians, scattered where the object stood, is trained
+against the same single inpainted image.
 
 In addition to PSNR and SSIM, the rows have PSNR after a blur (``coarse_psnr``) and the gradient energy relative to the
-truth's (``detail``; 1 is ideal), because PSNR favours a blur where the true pixels cannot be known. ``face_on``
-quantifies this with both PSNRs on the plane for our inpainting, for one colour, and for the true floor itself, shifted
-into the hole.
+true floor's (``detail``; 1 is ideal), because PSNR favours a blurred result where the true pixels cannot be known.
+``face_on`` quantifies this preference: it contains both PSNRs, on the plane, for our inpainting, for one uniform
+colour, and for the true floor itself, shifted into the hole.
 
 Aims: ``beats_cv2_by_3db``, ``beats_no_prior_by_3db``, ``inpaint_beats_rectified_cv2`` (mean PSNR over the cases),
-``seconds_on_gpu`` (every case at most 20 s), ``hole_size_independent`` (the times for two holes, one with four
-times the area of the other, differ by at most a factor of 1.5).
+``seconds_on_gpu`` (every case at most 20 s), ``hole_size_independent`` (the times for two holes, one with four times
+the area of the other, differ by at most a factor of 1.5).
 """
 
 from __future__ import annotations
@@ -69,7 +71,7 @@ class Case:
 
 
 def built_in(name: str, device: str) -> Case:
-    """Build the case of the floor under a built-in object."""
+    """Build the case of a built-in scene: the floor under its object."""
     built = scene(name, device=device)
     hole = footprint(built.object, built.plane)
     return Case(name, built.background, damaged(built.background, hole), hole, False)
@@ -111,7 +113,7 @@ def damaged(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
 
 
 def cameras_around(hole: Hole, size: int) -> list[Camera]:
-    """Return eight cameras on two rings; the first one takes the single image that the baseline trains on."""
+    """Return eight cameras on two rings; the first one renders the single image on which the baseline trains."""
     middle, side = hole.bounds()
     first, second = hole.plane.tangents()
     cameras = []
@@ -151,7 +153,8 @@ def best_by_opencv(image: np.ndarray, mask: np.ndarray, truth: np.ndarray) -> np
 def without_plane(
     case: Case, result: InpaintResult, camera: Camera, target: np.ndarray, steps: int, seed: int
 ) -> GaussianCloud:
-    """Train as many Gaussians as our inpainting adds, scattered over the volume of the object, against one image."""
+    """Train the number of Gaussians that our inpainting adds, scattered over the volume of the object, against one
+    image."""
     _, side = case.hole.bounds()
     remaining = result.cloud.subset(~result.is_new)
     count = int(result.is_new.sum())
@@ -300,7 +303,7 @@ def sheet(colours: list[np.ndarray], depths: list[np.ndarray], name: str) -> np.
 
 
 def size_rows(options: argparse.Namespace) -> list[Row]:
-    """Time, in turn, the inpainting of a round hole in the table cloth and of one with four times its area."""
+    """Time, alternately, the inpainting of a round hole in the table cloth and of a hole with four times its area."""
     built = scene("figurine", device=options.device)
     holes = {radius: disc(built.plane, np.array([0.1, 0.2, 0.0]), radius) for radius in (0.16, 0.32)}
     clouds = {radius: damaged(built.background, hole) for radius, hole in holes.items()}

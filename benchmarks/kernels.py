@@ -22,7 +22,7 @@ def hits_kernel(
     # Out:
     hits_out: wp.array[wp.int32],
 ):
-    """Count the splats that each pixel blends; every renderer of the same image has to blend them."""
+    """Count the splats that each pixel blends; every renderer of the same image must blend these splats."""
     thread = wp.tid()
     pixel = pixel_of_thread(thread, width)
     if pixel[0] >= width or pixel[1] >= height:
@@ -89,7 +89,7 @@ def arithmetic_kernel(
 #endif
 """)
 def vector_chains(row: wp.int32, start: wp.float32, factor: wp.float32, sum_out: wp.array[wp.float32]):
-    """Compute the chains of ``arithmetic_kernel`` in vectors of eight numbers, like compositing on a CPU."""
+    """Compute the chains of ``arithmetic_kernel`` in vectors of eight numbers, as compositing on a CPU does."""
     ...
 
 
@@ -113,7 +113,7 @@ def copy_kernel(
     # Out:
     target_out: wp.array[wp.vec4],
 ):
-    """Copy one array; its time is that of pure copying."""
+    """Copy one array, to measure the time of a pure copy."""
     row = wp.tid()
     store_row(target_out, row, load_row(source, row))
 
@@ -157,9 +157,9 @@ def trace_kernel(
 ):
     """Intersect each sample ray of each pixel with the mesh.
 
-    Outputs are the hit point at rest, the light there, which multiplies the paint, and the gloss, which is added
-    (Phong). Lamps rotate with each face (``rest_from_world``), because a capture has no lamps, only colours
-    that depend on the direction. Faces are two-sided.
+    Outputs are the hit point at rest, the light there, by which the paint is multiplied, and the gloss, which is added
+    (Phong). The lamps rotate with each face (``rest_from_world``), because a capture has no lamps, only colours that
+    depend on the direction. Faces are two-sided.
     """
     pixel, sample = wp.tid()
     x = float(pixel % width) + (float(sample % samples) + 0.5) / float(samples)

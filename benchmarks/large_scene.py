@@ -1,12 +1,12 @@
 """Memory and time of each stage from capture to film, for a scene of millions of Gaussians.
 
-A real capture (``--scene``) is repeated side by side along its plane until it has ``--gaussians`` Gaussians, with
-colours of degree 3, the highest degree of a capture. The object is that of the original copy, clicked as in
+A real capture (``--scene``) is repeated side by side along its plane until there are ``--gaussians`` Gaussians, with
+colours of degree 3, the highest degree of a capture. The object belongs to the original copy and is clicked as in
 ``scene_quality.py``. Stages: ``load`` reads the scene from a file, ``plane`` finds the support plane, ``ground``
 measures the ground, ``object`` segments the object, ``hole`` inpaints the floor, ``body`` builds the creature,
-``animate`` simulates ``--frames`` frames of a jump, ``film`` renders them in the scene.
-``peak`` is the peak resident memory of the whole process during the stage: the operating system's own count (VmHWM),
-reset before each stage, so it is measured on Linux only.
+``animate`` simulates ``--frames`` frames of a jump, ``film`` renders them in the scene. ``peak`` is the peak resident
+memory of the whole process during the stage. It is read from the operating system's counter VmHWM, which is reset
+before each stage, so it is measured on Linux only.
 
 Aims: ``memory`` (every stage within 16 GiB), ``three_minutes`` (all stages except ``animate`` together; only on a GPU).
 """

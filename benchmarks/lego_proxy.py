@@ -1,8 +1,8 @@
-"""NeRF-synthetic's lego as an object with a true mesh: surface and colours of a capture of it.
+"""NeRF-synthetic's lego as an object with a true mesh, built from the surface and colours of a capture.
 
-The photos have no geometry, so the true look of the bent model is unknown. A capture is trained from them, its surface
-(``capture_surface``) is the mesh, and its colours, in voxels near that surface, are the solid paint: a proxy that a
-cage deforms exactly. Table 1 then treats it like any other mesh.
+The photos have no geometry, so the true appearance of the bent model is unknown. Therefore a capture is trained from
+the photos. Its surface (``capture_surface``) is the mesh, and its colours, in voxels near that surface, are the solid
+texture. A cage deforms this proxy exactly, and Table 1 uses it like any other mesh.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from painted_meshes import Paint, PaintedMesh, standing, subdivided
 VOXELS = 256
 """Number of voxels along the height."""
 REACH = 3
-"""Distance from the surface up to which there is paint, voxels."""
+"""Maximum distance from the surface, voxels, at which the texture is defined."""
 
 
 def lego(*, gaussians: int, iterations: int, seed: int, device: str, cache: Path | None) -> PaintedMesh:

@@ -1,17 +1,18 @@
-"""Steps per second of many worlds in parallel on one device, against the number of worlds.
+"""Steps per second of many parallel worlds on one device, as a function of the number of worlds.
 
 python benchmarks/many_worlds.py [--quick] [--worlds B ...] [--nodes N ...] [--steps N] [--alone N] [--panel N]
     [--chunk-bytes N] [--matrices B] [--device cuda:0] [--json PATH] [--plot PATH]
 
-The pawn's jump is recorded once on each cage. Then each of the ``--worlds`` repeats the jump's first ``--steps`` steps
-with the recorded activations scaled by its own factor (0.7 to 1), and with its own friction coefficient (0.4 to 1.2).
-``LocomotionStepper`` also runs ``--alone`` of the worlds: ``apart`` is the largest distance of a node between the two
-runs, in body heights. Time by stage is measured over a few steps from the middle, in which every stage synchronises the
-device. ``--matrices`` also times, in ms, factorisations of this number of dense matrices of each cage's size,
-with panels of several widths and with torch's own Cholesky factorisation, and solutions for 1 and 96 right-hand sides.
+The pawn's jump is recorded once with each cage. Then each of the ``--worlds`` repeats the first ``--steps`` steps of
+the jump with its own friction coefficient (0.4 to 1.2) and with the recorded activations times its own factor (0.7 to
+1). ``LocomotionStepper`` also runs ``--alone`` of the worlds separately; ``apart`` is the largest distance between the
+positions of a node in the two runs, in body heights. Time by stage is measured over a few steps from the middle, in
+which every stage synchronises the device. ``--matrices`` also times, in ms, factorisations of this number of dense
+matrices of each cage's size, with panels of several widths and with torch's own Cholesky factorisation, and solutions
+for 1 and 96 right-hand sides.
 
-Aims: ``many_2000``, on one GPU 2,000 steps a second at 250 nodes and 600 at 541; ``many_alike``, on any device at most
-1e-9 body heights apart after 30 steps or more.
+Aims: ``many_2000`` (on one GPU, 2,000 steps per second with 250 nodes and 600 with 541), ``many_alike`` (on any device,
+runs at most 1e-9 body heights apart after 30 steps or more).
 """
 
 from __future__ import annotations
@@ -40,11 +41,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 REQUESTED_NODES = (175, 500)
-"""``--nodes`` that give the pawn cages of about 250 and 541 nodes."""
+"""Values of ``--nodes`` that give the pawn cages of about 250 and 541 nodes."""
 AIMS = {250: 2000.0, 541: 600.0}
-"""Steps per second to reach, by number of nodes."""
+"""Required steps per second, by number of nodes."""
 NODE_TOLERANCE = 0.1
-"""Relative tolerance of the number of nodes of an aim."""
+"""Maximum relative difference between a cage's number of nodes and the number of nodes of an aim."""
 MAX_DISTANCE, MIN_STEPS = 1e-9, 30
 STAGES = ("detect", "elasticity", "factor", "substitute", "coulomb")
 PANELS = (32, 64, 96, 128, 192)
@@ -54,7 +55,7 @@ _SPLIT = 3
 
 @dataclass
 class Stopwatch:
-    """Stopwatch that sums the seconds of each stage while ``on``."""
+    """Stopwatch that sums the seconds of each stage while ``on`` is True."""
 
     device: torch.device
     on: bool = False
@@ -82,7 +83,8 @@ def recorded(creature: Creature, steps: int) -> np.ndarray:
 
 
 def measure(creature: Creature, jump: np.ndarray, worlds: int, *, alone: int, panel: int, chunk_bytes: int) -> Row:
-    """Measure the rate of ``worlds`` worlds, the time by stage, and how far ``alone`` of them are from single runs."""
+    """Measure the rate of ``worlds`` worlds, the time by stage, and the deviation of ``alone`` of the worlds from
+    single runs."""
     device = torch.device(str(creature.body.assembly.device))
     watch = Stopwatch(device)
     dt, _ = solver_steps(creature.body)
@@ -216,7 +218,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def summary(rows: list[Row], device: str) -> dict[str, Any]:
-    """Return the aims, and a reason for each that is None."""
+    """Return the aims, and a reason for each aim that is None."""
     best = {
         nodes: max((row["rate"] for row in rows if abs(row["nodes"] - nodes) <= NODE_TOLERANCE * nodes), default=None)
         for nodes in AIMS

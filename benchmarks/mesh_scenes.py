@@ -1,4 +1,4 @@
-"""Scenes with a known truth for Table 1 and Figure 8: cages, known deformations, a ray caster, training."""
+"""Scenes with a known truth for Table 1 and Figure 8: cages, known deformations, ray casting, training."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def twist_by(degrees: float) -> Motion:
 def ring(
     vertices: np.ndarray, count: int, size: int, *, elevations: tuple[float, ...], phase: float = 0.0
 ) -> list[Camera]:
-    """Return cameras around ``vertices`` (V, 3), which fill the images, at each elevation (degrees) in turn."""
+    """Return cameras around ``vertices`` (V, 3), at each elevation (degrees) in turn; the vertices fill the images."""
     lower, upper = vertices.min(axis=0), vertices.max(axis=0)
     centre, distance = 0.5 * (lower + upper), 1.5 * float(np.linalg.norm(upper - lower))
     vertical = np.array([0.0, 0.0, 1.0])
@@ -80,7 +80,7 @@ def ring(
 def photograph(
     mesh: PaintedMesh, vertices: np.ndarray, cameras: list[Camera], device: str, *, samples: int = 3
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Ray-cast the mesh at ``vertices``; returns colour (H, W, 3) on white and coverage (H, W) for each camera."""
+    """Ray-cast the mesh at ``vertices``; return colour (H, W, 3) on white and coverage (H, W) for each camera."""
     with wp.ScopedDevice(device):
         solid = wp.Mesh(wp.array(vertices, dtype=wp.vec3), wp.array(mesh.faces.ravel(), dtype=wp.int32))
         rest = wp.array(mesh.vertices, dtype=wp.vec3)
@@ -108,7 +108,7 @@ def photograph(
                 outputs=[where, hit, light, gloss],
             )
             hits = np.asarray(hit.numpy(), dtype=bool)
-            # Most pixels miss the mesh; compacting the samples saves memory.
+            # Most pixels miss the mesh, so store only samples that hit it.
             pixels = np.flatnonzero(hits.any(axis=1))
             covered = hits[pixels]
             sampled = np.ones((len(pixels), samples**2, 3))
@@ -127,7 +127,8 @@ def photograph(
 def face_rotations(mesh: PaintedMesh, vertices: np.ndarray) -> np.ndarray:
     """(F, 3, 3) rotation of each face from rest to ``vertices`` (V, 3).
 
-    It is the polar factor of the face's deformation gradient, which maps the unit normal at rest to the deformed one.
+    The rotation is the polar factor of the face's deformation gradient, which maps the unit normal at rest to the
+    deformed one.
     """
 
     def frames(points: np.ndarray) -> np.ndarray:
@@ -137,7 +138,7 @@ def face_rotations(mesh: PaintedMesh, vertices: np.ndarray) -> np.ndarray:
         return np.stack([b - a, c - a, normal], axis=2)
 
     before, after = frames(mesh.vertices), frames(vertices)
-    # A degenerate face has no rotation and is invisible.
+    # A degenerate face has no well-defined rotation and is invisible.
     sound = (np.linalg.det(before) > 1e-14) & (np.linalg.det(after) > 1e-14)
     turns = np.tile(np.eye(3), (len(mesh.faces), 1, 1))
     u, _, v = np.linalg.svd(after[sound] @ np.linalg.inv(before[sound]))
@@ -232,8 +233,8 @@ def trained_on(
         iterations=iterations,
         densification=Densification.RELOCATION if iterations >= 1000 else Densification.NONE,
         max_gaussians=gaussians,
-        # On a white background alone, white haze around the object would cost nothing, but a deformation would expose
-        # it.
+        # On a white background alone, white haze around the object would have no error in training, but a deformation
+        # would expose it.
         background=None,
         seed=seed,
     )

@@ -1,4 +1,5 @@
-"""Bodies modelled by signed distance functions for the benchmarks: with two to eight legs, one base or no feet."""
+"""Bodies modelled by signed distance functions for the benchmarks: with two to eight legs, with one base, or without
+feet."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ def _rod(
 
 
 def _legged(count: int, *, leg: float = 0.05, spread: float = 0.3, short: int | None = None) -> Distance:
-    """Return an egg with a head on ``count`` legs in a ring; leg ``short`` is 3 % too short."""
+    """Return an egg with a head on a ring of ``count`` legs; the leg ``short`` is 3 % too short."""
 
     def distance(points: np.ndarray) -> np.ndarray:
         out = ellipsoid(points, np.array([0.0, 0.0, 0.62]), np.array([0.32, 0.32, 0.16]))
@@ -147,7 +148,7 @@ def _giraffe(points: np.ndarray) -> np.ndarray:
 
 
 def _ostrich(points: np.ndarray) -> np.ndarray:
-    """Two legs with long feet under a horizontal trunk, and a neck in front."""
+    """Two legs with long feet under a horizontal trunk, and a neck at the front."""
     out = ellipsoid(points, np.array([-0.04, 0.0, 0.6]), np.array([0.26, 0.19, 0.16]))
     for y in (0.12, -0.12):
         leg = _rod(points, [0.0, 1.1 * y, 0.05], [-0.02, y, 0.55], 0.055, 0.075)
@@ -186,7 +187,7 @@ UNSEEN: dict[str, Distance] = {
     "spider": _spider,
     "dachshund": _dachshund,
 }
-"""Held-out bodies: modelled after the motions were finished, and not used to tune anything."""
+"""Held-out bodies, modelled after the motions were finished and not used to tune anything."""
 
 
 def modelled(name: str) -> Body:

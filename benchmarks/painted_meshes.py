@@ -13,9 +13,10 @@ import numpy as np
 from harness import data_folder
 
 Paint = Callable[[np.ndarray], np.ndarray]
-"""Solid texture: colours (P, 3), 0 to 1, of points (P, 3) of the rest shape."""
+"""Solid texture: function that returns colours (P, 3), 0 to 1, at points (P, 3) of the rest shape."""
 MAX_EDGE_LENGTH = 0.02
-"""Maximum edge length on an object 1 high: a bend by 80 degrees puts an edge's midpoint 7e-5 off the true surface."""
+"""Maximum edge length on an object of height 1: in a bend by 80 degrees, the midpoint of such an edge deviates by 7e-5
+from the true surface."""
 
 
 @dataclass(frozen=True)
@@ -24,16 +25,16 @@ class PaintedMesh:
 
     name: str
     vertices: np.ndarray
-    """(V, 3) float64."""
+    """(V, 3) float64, vertices."""
     faces: np.ndarray
-    """(F, 3) int32."""
+    """(F, 3) int32, triangles as indices of vertices."""
     paint: Paint
     glossy: bool = False
-    """True if the mesh is lit by lamps that rotate with each part of the body; a capture stores light in this form."""
+    """True if the mesh is lit by lamps that rotate with each part of the body. A capture stores light in this form."""
 
 
 def checkers(cell: float, colours: tuple[tuple[float, ...], ...]) -> Paint:
-    """Solid texture of cubes of side ``cell`` in two colours, with a tint that varies with height."""
+    """Solid texture of cubes with side ``cell`` in two colours, with a tint that varies with height."""
 
     def paint(points: np.ndarray) -> np.ndarray:
         parity = np.floor(points / cell + 1e-6).astype(int).sum(axis=1) % 2
@@ -88,7 +89,7 @@ def _standing(vertices: np.ndarray) -> np.ndarray:
 def subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Subdivide edges until none is longer than ``MAX_EDGE_LENGTH``.
 
-    The deformed mesh is the truth, and a long edge would stay straight where the surface bends.
+    The deformed mesh is the ground truth, and a long edge would stay straight where the surface bends.
     """
     while True:
         sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)
@@ -101,7 +102,7 @@ def subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
         vertices = np.concatenate([vertices, vertices[edges].mean(axis=1)])
         count = long.sum(axis=1)
         parts = [faces[count == 0]]
-        # Rotate the corners so that a single halved side is the first, and a single undivided side the last.
+        # Rotate the corners so that a single subdivided edge is the first, and a single undivided edge the last.
         for halved in (1, 2, 3):
             chosen = count == halved
             first = {1: long.argmax(axis=1), 2: (~long).argmax(axis=1) + 1, 3: np.zeros(len(faces), dtype=int)}[halved][
@@ -223,7 +224,8 @@ def _box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, n
 
 
 def bar() -> PaintedMesh:
-    """The checkered bar of Figure 8: a quarter as thick as high, with long bricks, which favour long Gaussians."""
+    """The checkered bar of Figure 8, a quarter as thick as high, with long bricks, which are represented by long
+    Gaussians."""
     corners, faces = _box((-0.125, -0.125, 0.0), (0.125, 0.125, 1.0))
     vertices, faces = subdivided(corners, faces)
 

@@ -1,12 +1,13 @@
 """Reproduce every table and figure of the paper from scratch: `make paper`.
 
-Runs the scripts of the tables and figures in sequence and prints which one runs, how many there are and how long each
-took. ``--out`` (``out/paper``) receives the output (``.txt``), the numbers (``.json``) and the image (``.png``) of each
-script, the films of the figures that show motions, and ``paper.md``, which lists all aims, with a reason for each that
-cannot be judged on this device. With ``--keep`` stages whose JSON exists are skipped, so an interrupted run can be
-continued.
+Runs the scripts of the tables and figures in sequence and prints the current script, the number of scripts and the time
+that each one took. ``--out`` (``out/paper``) receives the output (``.txt``), the numbers (``.json``) and the image
+(``.png``) of each script, the films of the figures that show motions, and ``paper.md``, which lists all aims, with a
+reason for each aim that cannot be judged on this device. ``--keep`` skips stages whose JSON exists, so that an
+interrupted run can be continued.
 
-The aims are those of the scripts, such as ``table1.split_helps``; the rows give the exit status of each script.
+The aims are the aims of the scripts, with names such as ``table1.split_helps``; the rows give the exit status of each
+script.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ class Stage:
     script: str
     """Path in the repository."""
     arguments: tuple[str, ...] = ()
-    """Arguments; OUT stands for the output folder."""
+    """Command-line arguments; OUT is replaced by the output folder."""
     quick: tuple[str, ...] = ("--quick",)
     device: str | None = None
-    """Device on which it always runs; None for that of ``--device``."""
+    """Device on which the script always runs; None for the device of ``--device``."""
     judges: bool = True
-    """True if it takes the benchmarks' flags and writes JSON."""
+    """True if the script takes the benchmarks' flags and writes JSON."""
 
 
 def animated(name: str, figure: int) -> Stage:

@@ -12,26 +12,29 @@ import numpy as np
 import torch
 
 PIXELS_PER_DEGREE = 67.0206
-"""Pixels per degree of the visual field, 0.7 m in front of a screen 0.7 m wide with 3840 columns: FLIP's default."""
+"""Pixels per degree of the visual field for a viewer 0.7 m in front of a screen 0.7 m wide with 3840 columns: FLIP's
+default."""
 _XYZ_FROM_RGB = (
     (10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794),
     (2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897),
     (1425376 / 73733382, 8788810 / 73733382, 70074185 / 73733382),
 )
 _SENSITIVITIES = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
-"""Contrast sensitivity, achromatic, red-green and blue-yellow: weights and widths of Gaussians in frequency."""
+"""Contrast sensitivity, achromatic, red-green and blue-yellow: weights and widths of Gaussians in the frequency
+domain."""
 _FEATURE_DEGREES = 0.082
-"""Width of the edges and points that the feature detector responds to, degrees."""
+"""Width of the edges and points to which the feature detector responds, degrees."""
 _COLOUR_POWER, _FEATURE_POWER = 0.7, 0.5
 _KNEE, _KNEE_VALUE = 0.4, 0.95
-"""Colour differences up to this fraction of the largest one are mapped to this fraction of the scale."""
+"""Colour differences up to the first number, as a fraction of the largest one, are mapped linearly to 0 to the second
+number."""
 
 
 def flip_error(picture: torch.Tensor, target: torch.Tensor) -> float:
     """Mean FLIP (Andersson et al. 2020, low dynamic range) of two images (H, W, 3), sRGB from 0 to 1.
 
-    0 means equal, 1 the largest difference. FLIP predicts the difference that a viewer sees when flipping between the
-    two images.
+    0 means equal images, 1 the largest difference. FLIP predicts the difference that a viewer perceives when
+    alternating between the two images.
     """
     pair = [one.permute(2, 0, 1)[None].double() for one in (target, picture)]
     opponents = [_opponent(_linear(one.clamp(0.0, 1.0))) for one in pair]
@@ -49,7 +52,7 @@ def _mixed(matrix: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
 
 
 def _xyz(planes: torch.Tensor) -> torch.Tensor:
-    """(1, 3, H, W) XYZ of linear RGB, relative to the white point."""
+    """(1, 3, H, W) XYZ of linear RGB ``planes``, relative to the white point."""
     matrix = torch.tensor(_XYZ_FROM_RGB, dtype=planes.dtype, device=planes.device)
     return _mixed(matrix / matrix.sum(dim=1, keepdim=True), planes)
 
@@ -111,7 +114,7 @@ def _colour_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
 
 
 def _feature_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """(1, 1, H, W) from 0 to 1: edges or points that only one of two lightness planes (1, 1, H, W) has."""
+    """(1, 1, H, W) from 0 to 1: edges or points that exist in only one of two lightness planes (1, 1, H, W)."""
     deviation = 0.5 * _FEATURE_DEGREES * PIXELS_PER_DEGREE
     radius = int(np.ceil(3.0 * deviation))
     x = torch.arange(-radius, radius + 1, dtype=one.dtype, device=one.device)
@@ -139,7 +142,8 @@ def _convolved(plane: torch.Tensor, along_x: torch.Tensor, along_y: torch.Tensor
 
 
 def lpips_distance() -> tuple[Callable[[np.ndarray, np.ndarray], float] | None, str | None]:
-    """Return the distance function of two images (H, W, 3), 0 to 1, and None; or None and the reason."""
+    """Return the LPIPS distance of two images (H, W, 3), 0 to 1, as a function, and None; or None and the reason if it
+    is unavailable."""
     try:
         import lpips  # pyright: ignore[reportMissingImports]
     except ImportError:

@@ -1,13 +1,13 @@
 """Accuracy of the fitted plane: 100 synthetic depth images with outliers and noise, and real captures view by view.
 
-A synthetic image is one view, 240 x 180 pixels, of a random plane with a ball that stands on it (about half of the
-outliers) and scattered wrong depths (the rest): 30 % of the masked pixels are wrong, all have 1 % noise. The extent is
-the diagonal of the visible part of the plane. In real captures, the fit to each of eight
-views is compared with the fit to all of them.
+A synthetic image is one view, 240 x 180 pixels, of a random plane. Of the masked pixels, 30 % are outliers: about half
+of them show a ball that stands on the plane, the rest have scattered wrong depths. All pixels have 1 % noise. The
+extent is the diagonal of the visible part of the plane. In real captures, the fit to each of eight views is compared
+with the fit to all of them.
 
-Aims: ``normal`` (within 0.1 degree in every scene), ``offset`` (within 0.1 % of the extent in every scene),
-``paper_start`` (the paper's start leads to the same planes), ``real_views_agree`` (each view alone within 0.5 degree of
-all together).
+Aims: ``normal`` (within 0.1 degrees in every scene), ``offset`` (within 0.1 % of the extent in every scene),
+``paper_start`` (the paper's start leads to the same planes), ``real_views_agree`` (the fit to each view is within 0.5
+degrees of the fit to all views).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def synthetic_view(random: np.random.Generator) -> tuple[Plane, PlaneView, float
     truth, rays = plane_depth(plane, camera), camera_rays(camera)
     mask = (truth > 0.0) & (truth < 4.0 * distance)
     depth = truth.copy()
-    # A ball that touches the plane near the middle: connected outliers that begin at the plane itself.
+    # A ball that touches the plane near the middle gives connected outliers that begin at the plane itself.
     radius = random.uniform(0.1, 0.2) * distance
     ball = centre + 0.2 * distance * (random.normal() * first + random.normal() * second) * 0.5 + radius * normal
     along = rays @ (ball - camera.centre)
@@ -110,7 +110,7 @@ def synthetic_rows(count: int, seed: int) -> list[Row]:
 
 
 def real_row(name: str, click: tuple[float, float, float], radius: float, device: str) -> Row:
-    """Fit each of eight ring views alone and all together, within ``radius`` of the ``click``."""
+    """Fit a plane to each of eight ring views alone and to all together, within ``radius`` of the ``click``."""
     cloud = read_capture(data_folder() / name, device=device).cloud
     coarse = find_planes(cloud, guess_up(cloud)[0])[0].plane
     point = np.array(click)

@@ -1,8 +1,8 @@
 """Speed and memory of ``<egs-player>`` in headless Chromium, for bundles of several sizes.
 
-A cage that was simulated for a jump carries more or fewer Gaussians of the same pawn. The page plays the film in a
-square of 480 pixels. Each new picture deforms and sorts all Gaussians. On a machine without a GPU, Chromium draws them
-on the CPU (SwiftShader), and ``renderer`` of the JSON says so.
+A cage that was simulated for a jump deforms different numbers of Gaussians of the same pawn. The page plays the film in
+a square of 480 pixels. For each new picture, all Gaussians are deformed and sorted. On a machine without a GPU,
+Chromium draws them on the CPU (SwiftShader), which ``renderer`` in the JSON records.
 
 Aims: ``first_picture`` (2 s for 20,000 Gaussians), ``film`` (25 pictures per second for 20,000 Gaussians).
 """
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 
 GAUSSIANS = (20_000, 200_000, 1_000_000)
 NODES = {250: 170, 500: 420}
-"""Approximate number of nodes, and the one to request from the mesher for it."""
+"""Approximate numbers of nodes, and the values to request from the mesher for them."""
 SIDE = 480
 """Width and height of the element, pixels."""
 _BODY_GAUSSIANS = 20_000
-"""Gaussians of the capture from which the cage is made."""
+"""Number of Gaussians of the capture from which the cage is built."""
 
 LOAD = """async (side) => {
     window.started = performance.now();
@@ -56,7 +56,7 @@ LOAD = """async (side) => {
     window.player = player;
     return await ready;
 }"""
-"""Script that opens the bundle and returns the milliseconds to its first picture."""
+"""Script that opens the bundle and returns the time to its first picture, ms."""
 
 PLAY = """async (seconds) => {
     const { view } = player;
@@ -78,7 +78,7 @@ PLAY = """async (seconds) => {
         renderer: gl.getParameter(name ? name.UNMASKED_RENDERER_WEBGL : gl.RENDERER),
     };
 }"""
-"""Script that plays and returns the new pictures per second."""
+"""Script that plays the bundle and returns the number of new pictures per second."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -129,7 +129,7 @@ def _jump(nodes: int) -> SimulatedRun:
 
 
 def _write(performance: SimulatedRun, count: int, folder: Path) -> Row:
-    """Write the page and the bundle of about ``count`` Gaussians into ``folder``; return their sizes."""
+    """Write the page and the bundle with about ``count`` Gaussians into ``folder``; return their sizes."""
     creature, trajectory = performance.creature, performance.trajectory
     cloud = creature.placed(pawn(gaussian_count=count).cloud)
     deformer = Deformer(cloud, embed_gaussians(cloud, creature.cage.mesh))

@@ -1,12 +1,13 @@
-"""Popping caused by splits: frame-to-frame difference after motion compensation, in an animation with bend and twist.
+"""Popping caused by splits: motion-compensated difference between successive frames of an animation with bend and
+twist.
 
-Every frame is rendered together with the optical flow to the next one, which is warped back by this flow and compared
-with the frame. The residual is smooth over time unless something pops. Three clouds are compared: unsplit; split once
-for the whole motion, as the engine does; and, as a control that has to be detected, split in every fourth frame by that
-frame's bend.
+For every frame, the optical flow to the next frame is also rendered. The next frame is warped back by this flow and
+compared with the frame. The residual is smooth over time unless something pops. Three clouds are compared: unsplit;
+split once for the whole motion, as the engine does; and, as a control whose pops must be detected, split in every
+fourth frame by that frame's bend.
 
-A frame pops if the difference exceeds 1.3 times that of the frames around it. Aims: ``no_popping`` (split for the
-motion, no frame pops), ``control_pops`` (the measure detects the control).
+A frame pops if its difference exceeds 1.3 times the median difference of the frames around it. Aims: ``no_popping`` (no
+frame of the cloud that was split for the motion pops), ``control_pops`` (the measure detects the control).
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ POP = 1.3
 
 
 def projected(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """(P, 2) pixels."""
+    """(P, 2) projections of ``points`` (P, 3), pixels."""
     local = points @ camera.rotation.T + camera.translation
     return local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
@@ -57,7 +58,7 @@ def flow_to(camera: Camera, now: GaussianCloud, after: GaussianCloud) -> np.ndar
 
 
 def differences(camera: Camera, clouds: list[GaussianCloud], flows: list[np.ndarray]) -> np.ndarray:
-    """(F - 1,) root mean square of each frame minus the next one warped back by ``flows``."""
+    """(F - 1,) root mean square difference between each frame and the next frame warped back by ``flows``."""
     pictures = [render_gaussians(cloud, camera).colour.numpy() for cloud in clouds]
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(float)
     result = []
@@ -71,7 +72,7 @@ def differences(camera: Camera, clouds: list[GaussianCloud], flows: list[np.ndar
 
 
 def pops(values: np.ndarray) -> np.ndarray:
-    """Return each value divided by the median of the six around it."""
+    """Return each value divided by the median of the six values around it."""
     around = np.stack([np.roll(values, shift) for shift in (-3, -2, -1, 1, 2, 3)])[:, 3:-3]
     return values[3:-3] / np.median(around, axis=0)
 
@@ -113,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     each = []
     state = None
     for nodes in frames:
-        # The control is split in every fourth frame.
+        # Split the control in every fourth frame.
         if len(each) % 4 == 0:
             measured, where = (cloud, embedding) if state is None else (state.cloud, state.embedding)
             state = split_bent(

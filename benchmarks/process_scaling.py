@@ -1,12 +1,12 @@
-"""Steps per second of `simulate_many`, against the number of processes.
+"""Steps per second of `simulate_many`, as a function of the number of processes.
 
 python benchmarks/process_scaling.py [--quick] [--workers N ...] [--nodes N ...] [--frames N] [--jobs N] [--device cpu]
     [--json PATH] [--plot PATH]
 
 Each of the ``--workers`` processes simulates the first ``--frames`` frames of ``--jobs`` standing jumps of the pawn,
-each with a different distance. The rate is that of the middle 70 % of all frames, when all workers have started and
-none has run out of jobs; the time that they take to load is reported separately. Each process has one thread, which is
-slower if the cores share memory bandwidth or reduce their clock rate when all are busy.
+each with a different distance. The rate is measured over the middle 70 % of all frames, when all workers have started
+and none has run out of jobs; the time for loading the workers is reported separately. Each process has one thread. A
+process is slower if the cores share memory bandwidth or reduce their clock rate when all are busy.
 
 This benchmark has no aim; ``many_worlds.py`` measures parallel worlds on a GPU.
 """
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 REQUESTED_NODES = (175, 500)
-"""``--nodes`` that give the pawn cages of about 250 and 541 nodes."""
+"""Values of ``--nodes`` that give the pawn cages of about 250 and 541 nodes."""
 FIRST, LAST = 0.15, 0.85
 """Fractions of all frames between which the rate is measured."""
 

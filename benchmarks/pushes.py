@@ -3,8 +3,8 @@
 python benchmarks/pushes.py [--quick] [--nodes N] [--bodies NAME ...] [--pushes LINE ...] [--json PATH]
 
 A body withstands a push if it does not fall, no sole ever moves 0.05 body heights or more, and it ends at rest within 5
-degrees of upright. Sizes are multiples of 0.05 m sqrt(g H), up to 3.15; that of a gust is its whole impulse.
-They are found by bisection, which assumes that a body that withstands a push also withstands smaller ones.
+degrees of upright. Sizes are multiples of 0.05 m sqrt(g H), up to 3.15; the size of a gust is its total impulse. They
+are found by bisection, which assumes that a body that withstands a push also withstands smaller ones.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sweep import bounds_broken
 
 KINDS = ("0.3 {} ahead", "0.3 {} left", "0.3 {} left 0.8", "0.3-1.3 {} left")
 STEP, MAX_STEPS = 0.05, 63
-"""Step of the sizes, m sqrt(g H), and largest number of steps that is tried."""
+"""Step of the sizes, m sqrt(g H), and maximum size in steps."""
 STAND = "stand 2"
 MAX_SHIFT, MAX_TILT = 0.05, 5.0
 """Maximum displacement of a sole, body heights, and maximum tilt, degrees."""

@@ -1,12 +1,13 @@
-"""OSQP and DAQP on the engine's quadratic programs, against the number of contacts.
+"""OSQP and DAQP on the engine's quadratic programs, as a function of the number of contacts.
 
 python benchmarks/qp_solvers.py [--quick] [--device cpu] [--seed 0] [--body pawn] [--json PATH] [--plot PATH]
 
 The programs are steps of an animation (Eq. 13) with 40 muscle groups, 4 friction directions and 1 to 32 contacts.
-``first`` is the set-up and solution of the program for one choice of contact states, ``again`` its solution for other
-states, which changes only bounds, and ``search`` the engine's whole search of a step over contact modes, with
-activations as the only unknowns. All solvers get the same programs in turn. ``breach`` is the largest violation of a
-bound (forces in body weights, velocities in sqrt(g H)); ``objective`` is relative to DAQP's. This benchmark has no aim.
+``first`` is the time to set up and solve the program for one choice of contact states. ``again`` is the time to solve
+it for other states, which changes only bounds. ``search`` is the time of the engine's whole search of a step over
+contact modes, with activations as the only unknowns. All solvers get the same programs in turn. ``breach`` is the
+largest violation of a bound (forces in body weights, velocities in sqrt(g H)); ``objective`` is relative to DAQP's.
+This benchmark has no aim.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """Speed and image difference of the renderer: against gsplat and gswarp on a GPU, against plain PyTorch on a CPU.
 
 Aims: ``cuda_beats_gswarp`` (faster in every cell), ``cuda_within_1_3_of_gsplat`` (geometric mean of all cells),
-``ahead_of_gsplat_every_cell`` (packed or not, whichever is faster), ``same_picture`` (mean difference below 1e-5, and
-below 1e-3 away from the alpha-cut boundaries), ``same_in_every_mode`` (the same antialiased, for mean depth, with
-masked tiles, and with three cameras with a background each), ``cpu_vs_twin`` (20 times as fast as a tile-batched
-PyTorch rasteriser with the same culling), ``cpu_two_threads`` (1.7 times as fast as one thread).
+``ahead_of_gsplat_every_cell`` (faster than the faster of gsplat's packed and unpacked modes), ``same_picture`` (mean
+difference below 1e-5, and below 1e-3 away from the alpha-cut boundaries), ``same_in_every_mode`` (the same for
+antialiased images, for mean depth, with masked tiles, and with three cameras with a background each), ``cpu_vs_twin``
+(20 times as fast as a tile-batched PyTorch rasteriser with the same culling), ``cpu_two_threads`` (two threads 1.7
+times as fast as one).
 
 No other renderer that claims CPU support runs on a CPU: ``render_peers.cpu_baselines`` tries them and records why.
 """
@@ -49,8 +50,8 @@ AIMS = (
 def cuda_rows(
     points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats: int, table: Table, others: Sequence[str]
 ) -> list[Row]:
-    """Return one row per cell: times of the forward pass, alone and with the backward pass, of our renderer and of the
-    installed ones in ``others``."""
+    """Return one row per cell: times of the forward pass alone, and with the backward pass, for our renderer and for
+    the installed renderers among ``others``."""
     renderers: dict[str, peers.Renderer] = {"ours": peers.ours}
     for name in others:
         try:
@@ -86,7 +87,7 @@ def cuda_rows(
         row["difference"] = {
             name: difference(pictures["ours"], picture) for name, picture in pictures.items() if name != "ours"
         }
-        # Last, because the other renderers share leaf tensors, whose gradients they overwrite.
+        # Measure these gradients last, because the other renderers share leaf tensors, whose gradients they overwrite.
         for name in ("ours", "gsplat"):
             if name in renderers:
                 both(name)
@@ -101,7 +102,7 @@ def cuda_rows(
 
 
 def _gradient_differences(scenes: dict[str, peers.Scene]) -> dict[str, float]:
-    """Relative L2 difference from gsplat's gradients, converted to the parameters of captures by the chain rule."""
+    """Return the relative L2 difference from gsplat's gradients, after the chain rule to the parameters of captures."""
     if "gsplat" not in scenes:
         return {}
     own, other = scenes["ours"], scenes["gsplat"]
@@ -111,14 +112,15 @@ def _gradient_differences(scenes: dict[str, peers.Scene]) -> dict[str, float]:
         "means": (mine["means"], theirs["means"]),
         "log_scales": (mine["scales"], theirs["scales"] * other.scales.detach()),
         "opacity_logits": (mine["opacities"], theirs["opacities"] * opacity * (1 - opacity)),
-        # Where our renderer clamps a colour to 0, its gradient is zero; gsplat does not clamp the colours it is given.
+        # Where our renderer clamps a colour to 0, its gradient is zero; gsplat does not clamp its input colours.
         "sh": (mine["colours"][:, 0], theirs["colours"] * peers.SH_BAND_0 * (mine["colours"][:, 0] != 0)),
     }
     return {name: float((one - two).norm() / two.norm()) for name, (one, two) in pairs.items()}
 
 
 def memory_row(*, seed: int) -> Row:
-    """Peak GPU memory of one 1920 x 1080 image of five million Gaussians with SH of degree 3, capture included."""
+    """Measure the peak GPU memory of one 1920 x 1080 image of five million Gaussians with SH of degree 3, including the
+    capture."""
     device, count = wp.get_device("cuda:0"), 5_000_000
     random = torch.Generator(device="cuda").manual_seed(seed)
 
@@ -185,7 +187,8 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
     project_and_list = by_stage[f"project {threads}"] + by_stage[f"lists {threads}"]
     twin_times: dict[int, float] = {}
     twin = torch.empty(0)
-    # Take the better of both thread counts: on a busy machine PyTorch's threads block one another at every operation.
+    # Take the better of both thread counts, because on a busy machine PyTorch's threads block one another at every
+    # operation.
     with torch.no_grad():
         for count in sorted({1, threads}):
             torch.set_num_threads(count)
@@ -208,7 +211,8 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
 
 
 def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """Return the aims, derived from the rows alone, and a reason for each that this run could not measure (None)."""
+    """Return the aims, computed from the rows alone, and a reason for each aim that this run could not measure
+    (None)."""
     aims: dict[str, bool | None] = dict.fromkeys(AIMS)
     why: dict[str, str] = {}
     cuda = [row for row in rows if row["kind"] == "cuda"]
@@ -258,7 +262,8 @@ def _same(off: dict[str, float]) -> bool:
     """Return True if two images are equal up to rounding.
 
     Rounding may decide whether a splat at its alpha cut, which contributes at most 1/255, is drawn. Therefore fewer
-    than one value in a thousand may differ by more than 1e-3, and none by as much as two such splats.
+    than one value in a thousand may differ by more than 1e-3, and no value may differ by the contribution of two such
+    splats.
     """
     return off["mean"] < 1e-5 and off["above_1e-3"] < 1e-3 and off["largest"] < 2 / 255
 
@@ -294,7 +299,8 @@ def draw(figure: Figure, rows: list[Row]) -> None:
 
 
 def plot_roofline(rows: list[Row], axes: Any) -> None:
-    """Draw the percentage of the limit that each stage reaches, by cell; b or a marks bandwidth or arithmetic."""
+    """Draw the percentage of the limit that each stage reaches, by cell; b means that bandwidth is the limit, a
+    arithmetic."""
     names = ("project", "lists", "composite", "backward")
     for index, name in enumerate(names):
         stages = [row["stages"][name] for row in rows]
@@ -348,7 +354,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table(gaussians="9d", size="9s", what="<16", renderer="<12", ms="9.3f")
     if options.device.startswith("cuda"):
         cells = CELLS[:4] if options.quick else CELLS
-        # First, because the memory pool records only the peak since the process started.
+        # Measure the memory first, because the memory pool records only the peak since the process started.
         rows.append(memory_row(seed=options.seed))
         rows += cuda_rows(points, cells=cells, seed=options.seed, repeats=repeats, table=table, others=options.beside)
         if "gsplat" in rows[-1]["forward"]:

@@ -15,14 +15,15 @@ from harness import Row, median_ms
 
 _WIDTH, _HEIGHT = 648, 420
 _OPACITY_FACTOR = 0.35
-"""Factor on the opacities, so that no alpha reaches 0.99, where the renderers' limits differ."""
+"""Factor on the opacities that keeps all alphas below 0.99, where the renderers' limits differ."""
 _BACKGROUNDS = ((0.9, 0.2, 0.1), (0.1, 0.8, 0.3), (0.2, 0.3, 1.0))
 _MIN_ALPHA = 0.01
 """Minimum alpha of pixels whose mean depth is compared."""
 
 
 def difference(ours: torch.Tensor, other: torch.Tensor) -> dict[str, float]:
-    """Mean and largest absolute difference, and the fraction of values above 1e-3 (splats at their alpha cut)."""
+    """Return the mean and largest absolute difference, and the fraction of values above 1e-3 (splats at their alpha
+    cut)."""
     off = (ours - other).abs()
     return {"mean": float(off.mean()), "largest": float(off.max()), "above_1e-3": float((off > 1e-3).float().mean())}
 

@@ -1,4 +1,4 @@
-"""The other renderers of ``benchmarks/render.py`` with a common signature, and compositing in plain PyTorch."""
+"""The other renderers of ``benchmarks/render.py``, with a common signature, and compositing in plain PyTorch."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from egs_warp.render.tiles import TileLists
 
 @dataclass(frozen=True)
 class Scene:
-    """Gaussians in the form that the other renderers take: leaf tensors of activated values."""
+    """Gaussians in the form that the other renderers accept: leaf tensors of activated values."""
 
     means: torch.Tensor
     rotations: torch.Tensor
@@ -78,14 +78,15 @@ Renderer = Callable[[Scene, Camera], torch.Tensor]
 
 
 def ours(scene: Scene, camera: Camera) -> torch.Tensor:
-    """Render ``scene``, already converted by ``ours_scene``, as (H, W, 3); so the conversion is not timed."""
+    """Render ``scene`` as (H, W, 3). ``ours_scene`` must have converted the scene before, so that the conversion is not
+    timed."""
     return render_torch(
         scene.means, scene.rotations, scene.scales, scene.opacities, scene.colours, camera, background=(0.0, 0.0, 0.0)
     ).colour
 
 
 def ours_scene(scene: Scene) -> Scene:
-    """Return the same Gaussians in the parameters of captures: log scales, opacity logits, SH of degree 0."""
+    """Return the same Gaussians as parameters of captures: log scales, opacity logits, SH of degree 0."""
     return Scene(
         means=scene.means.detach().clone().requires_grad_(),
         rotations=scene.rotations.detach().clone().requires_grad_(),
@@ -96,7 +97,8 @@ def ours_scene(scene: Scene) -> Scene:
 
 
 def _once_per_camera(make: Callable[[Camera], Any]) -> Callable[[Camera], Any]:
-    """Cache ``make`` by camera, because the other renderers take GPU tensors, whose creation must not be timed."""
+    """Cache ``make`` by camera, because the other renderers take GPU tensors, and the creation of these must not be
+    timed."""
     cache: dict[int, tuple[Camera, Any]] = {}
 
     def get(camera: Camera) -> Any:
@@ -181,11 +183,12 @@ def gswarp_renderer() -> Renderer:
 
 
 def cpu_baselines(scene: Scene, camera: Camera) -> dict[str, dict[str, Any]]:
-    """Try each renderer of the package index that claims CPU support.
+    """Run each renderer in the package index that claims CPU support.
 
-    Tried with splax 0.2.3 on JAX 0.10.2, which rejects splax's Warp calls on a CPU ("JaxCallableGraphMode.WARP is not
-    supported for JAX CPU FFI calls"), and taichi-splatting 0.13 on taichi 1.7.4 (the taichi-nightly that it requires is
-    in no index), whose import compiles CUDA code ("CUDA_HOME environment variable is not set").
+    None works. splax 0.2.3 was tried on JAX 0.10.2, which rejects splax's Warp calls on a CPU
+    ("JaxCallableGraphMode.WARP is not supported for JAX CPU FFI calls"). taichi-splatting 0.13 was tried on taichi
+    1.7.4, because the taichi-nightly that it requires is in no index; its import compiles CUDA code ("CUDA_HOME
+    environment variable is not set").
 
     Args:
         scene: Gaussians in the parameters of captures (``ours_scene``).
@@ -235,9 +238,11 @@ def _taichi_splatting_ms(scene: Scene, camera: Camera) -> float | None:
 
 
 def composite_in_torch(projected: ProjectedGaussians, lists: TileLists, camera: Camera) -> torch.Tensor:
-    """Blend the tiles to an image (H, W, 3) in plain PyTorch, from the same tile lists, so that culling is the same.
+    """Blend the tiles to an image (H, W, 3) in plain PyTorch. The tile lists are the same as ours, so culling is the
+    same.
 
-    Tiles of similar length share a batch (tiles, 256 pixels, splats), which keeps PyTorch busy with little padding.
+    Tiles with lists of similar length share a batch (tiles, 256 pixels, splats), which gives PyTorch large operations
+    with little padding.
     """
     ellipse, falloff, colour = (
         wp.to_torch(array) for array in (projected.ellipse, projected.falloff, projected.colour_depth)
@@ -253,7 +258,7 @@ def composite_in_torch(projected: ProjectedGaussians, lists: TileLists, camera: 
     by_length = by_length[lengths[by_length] > 0]
     first = 0
     while first < len(by_length):
-        # Batches of about 100,000 pixel-splat pairs fit into the cache; larger ones take longer per pair.
+        # Batches of about 100,000 pixel-splat pairs fit into the cache; larger batches take longer per pair.
         longest = int(lengths[by_length[first]])
         size = max(1, 100_000 // (256 * max(longest, 1)))
         batch = by_length[first : first + size]

@@ -1,4 +1,4 @@
-"""Roofline of the renderer's stages: bytes to move, operations to do, and the machine's speed at both."""
+"""Roofline of the renderer's stages: bytes moved, operations computed, and the machine's peak rates of both."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from kernels import PROBE_STEPS, arithmetic_kernel, hits_kernel, vector_arithmet
 def stage_rows(cloud: GaussianCloud, camera: Camera, *, repeats: int, threads: int) -> dict[str, dict[str, Any]]:
     """Measure each stage's milliseconds, megabytes, millions of operations, and share of the device's limit.
 
-    The share is the time that the data transfer or the arithmetic, whichever is slower, needs at full speed, divided by
-    the measured time, which includes the calls from Python. Both speeds are measured here: with a copy of 1 GiB, and
-    with chains of multiply and add.
+    The share is the time that the data transfer or the arithmetic, whichever is slower, would take at the peak rate,
+    divided by the measured time, which includes the calls from Python. Both peak rates are measured here: with a copy
+    of 1 GiB, and with chains of multiply and add.
     """
     device = cloud.device
     view, background = view_from_camera(camera), Background(wp.vec3())
@@ -73,13 +73,14 @@ def stage_rows(cloud: GaussianCloud, camera: Camera, *, repeats: int, threads: i
 
 
 def device_limits(device: wp.Device) -> tuple[float, float]:
-    """Bytes per second of a long copy, reads and writes together, and single-precision operations per second."""
+    """Return the bytes per second of a long copy, reads and writes together, and the single-precision operations per
+    second."""
     size = 2**30 if device.is_cuda else 2**27
     source = wp.zeros(size // 4, dtype=wp.int32, device=device)
     target = wp.empty_like(source)
     lanes = 2**20 if device.is_cuda else 64
     sums = wp.zeros(lanes, dtype=wp.float32, device=device)
-    # A core computes eight numbers at once only with explicit vectors.
+    # A core computes eight numbers at once only if the vectors are explicit.
     kernel, width = (arithmetic_kernel, 1) if device.is_cuda else (vector_arithmetic_kernel, 8)
     times = median_ms(
         {
@@ -89,13 +90,14 @@ def device_limits(device: wp.Device) -> tuple[float, float]:
         repeats=7,
         synchronise=lambda: wp.synchronize_device(device),
     )
-    # Eight chains, two operations a step.
+    # Eight chains with two operations per step.
     operations = lanes * width * int(PROBE_STEPS) * 8 * 2
     return 2 * size / (times["copy"] * 1e-3), operations / (times["arithmetic"] * 1e-3)
 
 
 def arithmetic_by_threads(threads: int, sums: wp.array) -> None:
-    """Run work that scales perfectly with cores; its speed bounds that of ``threads`` threads of this machine."""
+    """Run work that scales perfectly with the number of cores; its speedup is an upper bound for ``threads``
+    threads."""
     launch_rows(
         arithmetic_kernel,
         len(sums),
@@ -131,7 +133,7 @@ def _counts(projected: ProjectedGaussians, lists: TileLists, view: Any) -> dict[
 def _bytes(count: int, counts: dict[str, float], pixels: int, *, cuda: bool, tiles: int) -> dict[str, float]:
     visible, pairs = counts["visible"], counts["pairs"]
     if cuda:
-        # Keys, slots and Gaussians are written; each radix pass reads and writes 12 bytes a pair; the search for the
+        # Keys, slots and Gaussians are written; each radix pass reads and writes 12 bytes per pair; the search for the
         # starts of tiles reads the keys again.
         sorting = pairs * (16 + 24 * -(-(31 + tiles.bit_length()) // 8) + 20)
     else:
@@ -148,16 +150,18 @@ def _bytes(count: int, counts: dict[str, float], pixels: int, *, cuda: bool, til
 
 
 def _operations(count: int, counts: dict[str, float]) -> dict[str, float]:
-    """Operations as counted in the kernels' source: a multiply, an add and a special function are one each."""
+    """Return the operations as counted in the kernels' source: a multiply, an add and a special function are one
+    operation each."""
     visible, pairs, hits = counts["visible"], counts["pairs"], counts["pixel_hits"]
     return {
-        # For all Gaussians the rotation and its product with the camera's and the scales; for visible ones the ellipse
-        # and the colour.
+        # For all Gaussians, the rotation matrix and its product with the camera's rotation and the scales; for visible
+        # Gaussians, the ellipse and the colour.
         "project": count * 150 + visible * 120,
-        # The span of each tile row, about two rows for three pairs; sorting does not count as arithmetic.
+        # The span of each tile row, about two rows per three pairs; sorting is not arithmetic.
         "lists": pairs * 30,
-        # Alpha: 12; blend: 10.
+        # 12 operations for alpha, 10 for blending.
         "composite": hits * 22,
-        # Alpha: 12; value, slope and transmittance: 20; ten sums: 24. Then the chain rule of each visible Gaussian.
+        # 12 for alpha, 20 for value, slope and transmittance, 24 for ten sums; then the chain rule of each visible
+        # Gaussian.
         "backward": hits * 56 + visible * 600 + pairs * 12,
     }

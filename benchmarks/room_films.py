@@ -1,9 +1,9 @@
-"""Films from photos or a capture, made as by a user, with at most three clicks; each stage is timed.
+"""Films from photos or a capture, made with at most three clicks, as by a user; each stage is timed.
 
-``scene_quality.py --films FOLDER`` runs all of them, ``scene_quality.py --films FOLDER --one koala`` a single scene, in
-this process. Annotated scenes use the clicks of ``clicking.py``, other scenes those below. The folder of a scene
-receives the film, its contact sheet ``sheet.png`` of twelve frames, the images that ``egs-warp animate`` writes for
-each stage, the trained capture, and ``row.json``.
+``scene_quality.py --films FOLDER`` makes all of them; ``scene_quality.py --films FOLDER --one koala`` makes the film of
+a single scene in this process. Annotated scenes use the clicks of ``clicking.py``, other scenes the clicks below. The
+folder of a scene receives the film, its contact sheet ``sheet.png`` of twelve frames, the images that ``egs-warp
+animate`` writes for each stage, the trained capture, and ``row.json``.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Filmed:
 
     motion: str
     photos: str | None = None
-    """Folder of posed photos below ``posed``, for scenes without annotations."""
+    """Folder of posed photos inside ``posed``, for scenes without annotations."""
     clicks: tuple[str, ...] = ()
     """Clicks in the notation of ``--object``, for scenes without annotations."""
 
@@ -69,7 +69,7 @@ FILMS: Mapping[str, Filmed] = {
 
 
 def is_here(name: str) -> bool:
-    """Return True if the data of a scene are on this machine."""
+    """Return True if the data of the scene ``name`` are available on this machine."""
     photos = FILMS[name].photos
     return (data_folder() / "posed" / photos).exists() if photos else read_drawn(name).is_here
 

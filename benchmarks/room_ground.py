@@ -1,4 +1,4 @@
-"""Error of a plane: for built-in scenes against the truth, for real ones against marked points."""
+"""Error of a plane: in built-in scenes relative to the truth, in real scenes relative to marked points."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from harness import Row
 def marked_plane(cloud: GaussianCloud, views: Sequence[DrawnView], up: np.ndarray) -> Plane:
     """Fit a plane to the marked ground points of ``views``, without the worst fifth of them.
 
-    The height at a mark is that of the splats there, because their rendered depth would put it too high.
+    The height at a mark is the height of the splats there, because their rendered depth would place it too high.
     """
     surfaces = [SeenSurface.of(cloud, view.camera) for view in views]
     plane = _through(surfaces, views, up, None)
@@ -29,7 +29,8 @@ def marked_plane(cloud: GaussianCloud, views: Sequence[DrawnView], up: np.ndarra
 
 
 def _through(surfaces: Sequence[SeenSurface], views: Sequence[DrawnView], up: np.ndarray, about: Plane | None) -> Plane:
-    """Fit a plane to the marks at their rendered depth, or, with ``about``, at the height of splats over that plane."""
+    """Fit a plane to the marks at their rendered depth or, with ``about``, at the height of the splats over that
+    plane."""
     places = []
     for surface, view in zip(surfaces, views, strict=True):
         depth = surface.depth if about is None else surface.depth_over(about)
@@ -53,13 +54,13 @@ def _fitted(points: np.ndarray, up: np.ndarray) -> Plane:
 
 
 def apart(first: Plane, second: Plane, foot: np.ndarray, height: float) -> tuple[float, float]:
-    """Return the angle between two planes, degrees, and their distance at ``foot`` (3,) in heights of the object."""
+    """Return the angle between two planes, degrees, and their distance at ``foot`` (3,), in heights of the object."""
     cosine = float(np.clip(first.normal @ second.normal, -1.0, 1.0))
     return float(np.degrees(np.arccos(cosine))), abs(float(first.heights(foot) - second.heights(foot))) / height
 
 
 def real_ground(annotated: DrawnScene, cloud: GaussianCloud, located: LocatedPlane) -> Row:
-    """Compare our plane (or the ground, if it is not flat) with the mean of two markings, and the markings with each
+    """Compare our plane, or our ground if it is not flat, with the mean of two markings, and the two markings with each
     other."""
     plane = located.plane
     foot = located.centre - plane.heights(located.centre) * plane.normal
@@ -78,7 +79,7 @@ def real_ground(annotated: DrawnScene, cloud: GaussianCloud, located: LocatedPla
 
 
 def known_ground(name: str, device: str) -> Row:
-    """Compare the plane located from a point in the middle of a built-in object with the true one."""
+    """Compare the plane that is located from a point in the middle of a built-in object with the true plane."""
     made = scene(name, device=device)
     cloud, truth = made.whole()
     heights = made.plane.heights(cloud.means.numpy()[truth])

@@ -1,13 +1,13 @@
-"""Shadow and shading of a turned toy in procedural rooms with a known light, against the truth.
+"""Shadow and shading of a moved toy in procedural rooms with a known light, compared with the truth.
 
-The rooms are those of ``room_scenes.py``, lit by a distant light of known direction and softness that casts shadows
-of all solids. Every fifth room is overcast. The light is estimated from the labelled object and the rest of the capture
+The rooms of ``room_scenes.py`` are lit by a distant light of known direction and softness that casts shadows of all
+solids. Every fifth room is overcast. The light is estimated from the labelled object and the rest of the capture
 (``egs_warp.lighting``). Then the toy is turned by 70 degrees and lifted by a quarter of its height, and its shadow on
-the ground and its colours are compared with those that the known light gives. ``before`` are the shadow straight below
-the object and the captured colours.
+the ground and its colours are compared with the results of the known light. ``before`` is the result without a light: a
+shadow straight below the object, and the captured colours.
 
-A point of the ground is in shadow if less than half of the light reaches it. Points that are in the shadow of other
-solids anyway do not count, and neither do rooms where the whole shadow lies there.
+A point of the ground is in shadow if less than half of the light reaches it. Points in the shadow of other solids are
+ignored, and so are rooms in which the whole shadow lies there.
 
 Aims: ``shadow_overlap`` (mean IoU of at least 0.6 over the lit rooms, and in none less than before), ``relit_psnr``
 (mean PSNR of the object at least 1.5 dB above that without relighting), ``clear`` (a light is found in at least nine
@@ -37,11 +37,11 @@ from room_scenes import SCENES, SyntheticScene, build_scene
 from room_solids import SceneLight, Solid
 
 TURN, LIFT = 70.0, 0.25
-"""Degrees about the vertical, and heights of the toy."""
+"""Rotation of the toy about the vertical axis, degrees, and lift, in heights of the toy."""
 
 
 def light_of_scene(number: int, seed: int, *, is_frontal: bool) -> SceneLight:
-    """Return the light of the room ``number``; a frontal light comes from the side of the photographer."""
+    """Return the light of the room ``number``; a frontal light comes from the photographer's side."""
     random = np.random.default_rng([seed, number, 7])
     low, high = (-150.0, -30.0) if is_frontal else (-180.0, 180.0)
     azimuth, elevation = np.radians([random.uniform(low, high), random.uniform(32.0, 62.0)])
@@ -153,12 +153,13 @@ def _overlaps(
     light: SceneLight,
     estimated: MainLight | None,
 ) -> Row:
-    """Return the overlap of the shadow with the true one: straight below the toy, and by the estimated light."""
+    """Return the overlap (IoU) with the true shadow of two shadows: straight below the toy, and cast by the estimated
+    light."""
     side = np.arange(-2.4, 2.41, 0.03)
     flat = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     points = np.column_stack([flat, scene.relief(flat)])
     others = scene.solids[1]
-    # What the toy stands on is a solid, too.
+    # The support of the toy is a solid, too.
     outside = ~np.any([one.contains(points + [0.0, 0.0, 0.01]) for one in others], axis=0) if others else True
     normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     counted = (light.visible(points, normals, others) > 0.5) & outside
@@ -186,7 +187,7 @@ def _overlaps(
 
 
 def aims_of(rows: Sequence[Row]) -> dict[str, bool]:
-    """Return the aims."""
+    """Return the aims, computed from the rows."""
     lit = [row for row in rows if row["is_lit"]]
     shadows = [row for row in lit if "iou" in row]
     gain = np.mean([row["psnr"] - row["psnr_before"] for row in lit])

@@ -1,9 +1,9 @@
 """Procedural rooms with a known object, as captures with labelled Gaussians: toys on duvets, floors, grass, furniture.
 
 A room is built directly as a capture: surfaces are sampled, and each sample becomes a flat Gaussian. Like a trained
-capture, it has large Gaussians on plain surfaces, Gaussians that bridge the object and what it touches and have mixed
-colours, haze in the air, hardly any Gaussians that no photo shows, and an arbitrary frame. The photos are taken by hand
-from the accessible side. Equal arguments give equal bits.
+capture, it has large Gaussians on plain surfaces, Gaussians with mixed colours that bridge the object and its
+surroundings, haze in the air, hardly any Gaussians that no photo shows, and an arbitrary frame. The photos are taken by
+hand from the accessible side. Equal arguments give equal bits.
 """
 
 from __future__ import annotations
@@ -31,15 +31,16 @@ Relief = Callable[[np.ndarray], np.ndarray]
 """Heights (n,) of the ground at (n, 2) points."""
 
 VIEWS = 8
-"""Annotated photos."""
+"""Number of annotated photos."""
 _PHOTOS = 16
-"""Photos, without the annotated ones."""
+"""Number of photos without annotations."""
 _SIDES = (320, 240)
 """Sides of a photo, pixels."""
 _BRIDGE = 0.07
-"""Distance, in heights of the object, within which Gaussians bridge the object and its surroundings."""
+"""Maximum distance from the surroundings, in heights of the object, of Gaussians that bridge the object and its
+surroundings."""
 _UNSEEN_SHARE = 0.1
-"""Share of the Gaussians without blending weight in the photos that remain."""
+"""Share of the Gaussians without blending weight in the photos that is retained."""
 _HAZE_SHARE = 0.01
 
 
@@ -52,7 +53,7 @@ class SceneLayout:
     support: str
     """``duvet``, ``floor``, ``carpet``, ``grass``, ``table``, ``chair``, ``sofa`` or ``shelf``."""
     neighbours: tuple[str, ...] = ()
-    """``wall``, ``wardrobe``, ``toys``, ``pillow``, or ``table`` for one that the toy is half under."""
+    """``wall``, ``wardrobe``, ``toys``, ``pillow``, or ``table`` for a table that covers half of the toy."""
     turned: float = 0.0
     """Rotation of the toy about the vertical axis, degrees."""
 
@@ -82,12 +83,12 @@ SCENES: Mapping[str, SceneLayout] = {
 """Layouts of the rooms by name."""
 
 _FLOOR = {"table": -2.0, "chair": -1.6, "sofa": -1.0, "shelf": -1.6}
-"""Height of the floor where the object stands on furniture."""
+"""Height of the floor below an object that stands on furniture."""
 
 
 @dataclass(frozen=True)
 class SyntheticScene:
-    """A capture of a room with its truth."""
+    """A capture of a room, with its ground truth."""
 
     name: str
     cloud: GaussianCloud
@@ -121,9 +122,9 @@ def build_scene(
 
     Args:
         name: name of the room.
-        seed: seed of everything that is random: folds, textures, defects, cameras, frame.
+        seed: seed of all random properties: folds, textures, defects, cameras, frame.
         density: factor of the number of Gaussians.
-        light: light that shades all surfaces and casts shadows; None for a fixed one without shadows.
+        light: light that shades all surfaces and casts shadows; None for a fixed light without shadows.
         device: Warp device.
     """
     layout, random = SCENES[name], np.random.default_rng([seed, list(SCENES).index(name)])
@@ -166,7 +167,7 @@ def _annotated(cloud: GaussianCloud, is_object: np.ndarray, camera: Camera) -> D
 
 @dataclass(frozen=True)
 class _SolidGroup:
-    """Solids with one spacing of Gaussians."""
+    """Solids whose Gaussians have the same spacing."""
 
     solids: list[solids.Solid]
     spacing: float
@@ -214,7 +215,7 @@ def _reach(one: solids.Solid, axis: int) -> float:
 def _relief(support: str, random: np.random.Generator) -> Relief | None:
     """Return the ground under the object; None if the object stands on furniture.
 
-    A toy sinks in a little: the mean height under it is 0.04 on a duvet and 0.02 on grass.
+    A toy sinks into soft ground: the mean height of the ground under it is 0.04 on a duvet and 0.02 on grass.
     """
     if support in ("floor", "carpet"):
         return lambda points: np.zeros(len(points))
@@ -309,8 +310,8 @@ def _lit(samples: SurfaceSamples, groups: list[_SolidGroup], light: SceneLight |
 def _painted(
     samples: SurfaceSamples, albedo: np.ndarray, lit: np.ndarray, random: np.random.Generator, *, plain: bool
 ) -> dict[str, np.ndarray]:
-    """Return the arrays of flat Gaussians of one surface with irradiance ``lit`` (n,); on a ``plain`` one they are
-    alike in colour."""
+    """Return the arrays of flat Gaussians of one surface with irradiance ``lit`` (n,); on a ``plain`` surface they have
+    similar colours."""
     noise = random.normal(1.0, 0.02 if plain else 0.10, (len(samples.points), 1))
     colour = np.clip(1.3 * albedo * lit[:, None] * noise, 0.0, 1.0) ** (1.0 / 2.2)
     cloud = flat_gaussians(samples, ((colour - 0.5) / SH_BAND_0)[:, None], random=random, device="cpu")
@@ -318,8 +319,8 @@ def _painted(
 
 
 def _bridge(fields: dict[str, np.ndarray], is_object: np.ndarray, random: np.random.Generator) -> None:
-    """Widen half of the Gaussians where the object touches its surroundings, and mix their colours with the other
-    side's."""
+    """Widen half of the Gaussians where the object touches its surroundings, and mix their colours with the colours of
+    the other side."""
     means, sh, scales = fields["means"], fields["sh"].copy(), fields["log_scales"]
     for side in (is_object, ~is_object):
         own, other = np.flatnonzero(side), np.flatnonzero(~side)

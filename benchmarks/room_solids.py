@@ -1,5 +1,5 @@
-"""Solids of the procedural rooms: ellipsoids and boxes whose surfaces are sampled, and the toys and furniture made of
-them."""
+"""Solids of the procedural rooms: ellipsoids and boxes whose surfaces are sampled, and the toys and furniture composed
+of them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from egs_warp.assets.surface import SurfaceSamples
 Colour = tuple[float, float, float]
 
 _AMBIENT, _SKY = 0.35, 0.2
-"""Irradiance from all sides, and that from above in addition."""
+"""Irradiance from all directions, and additional irradiance from above."""
 _RAYS = 16
-"""Rays to the disc of a light."""
+"""Number of rays to the disc of a light."""
 _OFFSET = 0.02
-"""Distance of a ray's origin from its surface; Gaussians lie up to a quarter of their spacing below theirs."""
+"""Distance of a ray's origin from its surface: Gaussians lie up to a quarter of their spacing below their surface."""
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,13 @@ class Solid:
     """An ellipsoid or a box."""
 
     centre: np.ndarray
-    """(3,) scene units."""
+    """(3,) centre, scene units."""
     half: np.ndarray
     """(3,) half axes, or half sides of a box, scene units."""
     colour: Colour
-    """Linear albedo."""
+    """Linear albedo of the surface."""
     turn: np.ndarray = field(default_factory=lambda: np.eye(3))
-    """(3, 3) columns: the axes in the room."""
+    """(3, 3) axes of the solid in the room, as columns."""
     is_box: bool = False
 
     def contains(self, points: np.ndarray) -> np.ndarray:
@@ -64,7 +64,7 @@ class Solid:
             count = max(int(4.0 * np.pi * products.mean() ** (1.0 / power) / spacing**2), 12)
             directions = random.normal(size=(8 * count, 3))
             directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-            # The area that a solid angle of the sphere covers on the ellipsoid is proportional to this length.
+            # The area on the ellipsoid that corresponds to a solid angle of the sphere is proportional to this length.
             stretch = np.linalg.norm(directions / self.half, axis=1)
             accepted = np.flatnonzero(random.uniform(0.0, stretch.max(), len(stretch)) < stretch)[:count]
             local = directions[accepted] * self.half
@@ -99,9 +99,9 @@ class SceneLight:
     direction: np.ndarray
     """(3,) unit vector to the light."""
     half_angle: float
-    """Degrees."""
+    """Half angle of the light's disc, degrees."""
     key: float
-    """Irradiance of a surface that faces it."""
+    """Irradiance of a surface that faces the light."""
 
     def visible(self, points: np.ndarray, normals: np.ndarray, solids: Sequence[Solid]) -> np.ndarray:
         """Return the fraction (n,) of the light's disc that reaches ``points`` (n, 3) with ``normals`` (n, 3)."""
@@ -147,7 +147,7 @@ def jittered_grid(half: np.ndarray, spacing: float, random: np.random.Generator)
 
 
 def on_both_sides(make: Callable[[float], Solid]) -> list[Solid]:
-    """Return ``make(-1)`` and ``make(1)``: the limbs of the two sides."""
+    """Return ``make(-1)`` and ``make(1)``, the limbs on the two sides."""
     return [make(-1.0), make(1.0)]
 
 
@@ -256,7 +256,7 @@ def sofa() -> list[Solid]:
 
 
 def shelf() -> list[Solid]:
-    """Create a bookcase, one board of which is at z = 0."""
+    """Create a bookcase with one of its boards at z = 0."""
     boards = [box((-1.3, -0.6, low - 0.08), (1.3, 0.7, low), _WHITE) for low in (-1.5, 0.0, 1.5)]
     sides = on_both_sides(lambda s: box((1.3 * s - 0.05, -0.6, -1.6), (1.3 * s + 0.05, 0.7, 1.55), _WHITE))
     books = [

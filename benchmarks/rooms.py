@@ -1,13 +1,13 @@
-"""Overlap, time and clearing of the object in procedural rooms with a known truth, from clicks and from masks.
+"""Overlap, time and plane clearing of the object in procedural rooms with a known truth, from clicks and from masks.
 
 The twenty rooms of ``room_scenes.py`` are captures with labelled Gaussians, and photos of them: toys on duvets, floors,
-grass and furniture, against walls, beside furniture, between other toys, half under a table. Eight photos are
-annotated with the truth. As in ``scene_quality.py``, every other one may be clicked or gives a mask, and the others
-judge the object alone, split at its ground, by the overlap (IoU); pixels where something in front hides the object do
-not count. ``before`` and ``after`` are the numbers of Gaussians of the object before and after the default clearing of
-the ground (fine-tuning). A row is a success if the object has an IoU of at least 0.9, so that it is complete and
-nothing else is included, and if its clearing ends with a finite object within the bound. Stains of a film are not
-judged. ``warnings`` in the JSON are those that ``egs-warp segment`` prints.
+grass and furniture, against walls, beside furniture, between other toys, half under a table. Eight photos are annotated
+with the truth. As in ``scene_quality.py``, every other annotated photo may be clicked or gives a mask. In the remaining
+ones, the overlap (IoU) of the object alone, split at its ground, is evaluated; pixels where something in front hides
+the object are ignored. ``before`` and ``after`` are the numbers of Gaussians of the object before and after the default
+clearing of the ground (fine-tuning). A row is a success if the IoU is at least 0.9, so that the object is complete and
+nothing else is included, and if the clearing ends with a finite object within the bound. Stains of a film are not
+evaluated. ``warnings`` in the JSON are the warnings that ``egs-warp segment`` prints.
 
 With ``--train``, each capture is trained from the photos first, as a user would; for all rooms this needs a GPU.
 
@@ -112,7 +112,7 @@ def is_clear(row: Row) -> bool:
 
 
 def aims_of(rows: Sequence[Row], names: Sequence[str]) -> dict[str, bool]:
-    """Return the aims."""
+    """Return the aims, computed from the rows of the rooms ``names``."""
     successes = {how: sum(row["success"] for row in rows if row["how"] == how) for how in CLICKS}
     return {
         "one_click": successes["1 click"] >= 0.9 * len(names),

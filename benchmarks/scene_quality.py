@@ -1,25 +1,24 @@
 """Quality and time from clicks or masks to an object, and from photos to a film, in real scenes.
 
-Five scenes have objects and ground annotated by hand in eight views each (``annotated_scenes.py``). ``masks``: the
-outlines of every other view are given. ``clicks``: the first click is on the innermost point of the object in the first
-view; two more correct the render of the object alone in the third and in the fifth view, each at the innermost point of
-the largest region that is missing or superfluous; regions thinner than 2 % of the image are ignored. Both are judged on
-the other views by the overlap (IoU) of the outlines with the pixels where the object alone, split at its plane, has an
-opacity above 0.5; pixels where the whole capture has a lower opacity are holes and do not count. Bonsai's cloud is
-trained first (or read from ``--trained``, or from the films).
+Five scenes have objects and ground annotated by hand in eight views each (``annotated_scenes.py``). For ``masks``, the
+outlines of every other view are given. For ``clicks``, the first click is on the innermost point of the object in the
+first view. Two more clicks correct the render of the object alone in the third and in the fifth view, each at the
+innermost point of the largest missing or superfluous region; regions thinner than 2 % of the image are ignored. Both
+are evaluated in the other views by the overlap (IoU) of the outlines with the pixels where the object alone, split at
+its plane, has an opacity above 0.5; pixels where the whole capture has a lower opacity are holes and are ignored.
+Bonsai's cloud is trained first (or read from ``--trained``, or from the films).
 
 With ``--films FOLDER``, films of bonsai, mouse and plush dog from photos, and of koala, fox, narcissus and playbot from
-a capture (``room_films.py``) are made first, ``--processes`` of them at a time; each stage is timed. For the ground,
-the planes of three built-in scenes are compared with the truth, and those of the real scenes with two markings, one in
-the even and one in the odd views, by the angle between normals and the distance at the object's foot
+a capture (``room_films.py``), are made first, ``--processes`` of them at a time; each stage is timed. For the ground,
+the planes of three built-in scenes are compared with the truth. The planes of the real scenes are compared with two
+markings, one in the even and one in the odd views, by the angle between normals and the distance at the object's foot
 (``room_ground.py``).
 
 Aims: ``iou_masks`` (mean of each scene 0.95, of the bonsai 0.90), ``iou_click`` (0.88 with three clicks and no model;
 one click with a mask model is not measured, because no model that takes clicks is available without external data),
-``ground``
-(built-in scenes: 1 degree and 0.5 % of the object's height; real ones: twice the difference of the markings), ``films``
-(each requested film exists and its motion is complete), ``psnr_vs_gsplat`` (held-out PSNR with the same colour fit for
-both: at least gsplat's on bonsai, mouse and plush dog; needs a GPU with gsplat, and ``--peers``).
+``ground`` (built-in scenes: 1 degree and 0.5 % of the object's height; real ones: twice the difference between the
+markings), ``films`` (each requested film exists and its motion is complete), ``psnr_vs_gsplat`` (held-out PSNR at least
+gsplat's on bonsai, mouse and plush dog, with the same colour fit for both; needs a GPU with gsplat, and ``--peers``).
 """
 
 from __future__ import annotations
@@ -55,7 +54,8 @@ TRAINING_CASES = ("bonsai", "mouse", "plush_dog")
 
 
 def film_rows(options: argparse.Namespace) -> list[Row]:
-    """Return one row per film, each made by its own process; a failed one has ``messages`` in place of results."""
+    """Return one row per film, each made by its own process; the row of a failed film has ``messages`` in place of
+    results."""
     threads = str(max(1, (os.cpu_count() or 1) // options.processes))
     limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
 

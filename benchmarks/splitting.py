@@ -1,11 +1,11 @@
 """Visibility of a split: image error of every rule by opacity and viewing direction, and the optimal opacities.
 
 A needle with a circular cross-section (thickness 0.3 of its length) is rendered whole and as children, from seven
-directions spread over the sphere; the error is the root mean square over directions and pixels, in percent of the
-opacity. The last columns are the opacities of the outer and the middle child of the MEASURED rule that minimise it: the
-table in egs_warp/deformation/splitting.py.
+directions spread over the sphere. The error is the root mean square over directions and pixels, in percent of the
+opacity. The last columns are the opacities of the outer and the middle child of the MEASURED rule that minimise the
+error: the table in egs_warp/deformation/splitting.py.
 
-Aims: ``table_is_optimal`` (no opacity of the table is more than 0.002 from the optimum computed here),
+Aims: ``table_is_optimal`` (no opacity of the table deviates by more than 0.002 from the optimum computed here),
 ``measured_beats_paper`` (at every opacity).
 """
 
@@ -29,7 +29,8 @@ ALONG, ACROSS = np.linspace(-4.0, 4.0, 81), np.linspace(0.0, 3.0, 16)
 
 
 def image_error(opacity: float, rule: SplitRule, peaks: np.ndarray, tilt: float) -> np.ndarray:
-    """Return the image of the children minus that of the parent, divided by the opacity, on a grid (16, 81).
+    """Return the difference between the images of the children and of the parent, divided by the opacity, on a grid
+    (16, 81).
 
     Args:
         opacity: peak opacity of the parent.
@@ -61,7 +62,7 @@ def all_errors(opacity: float, rule: SplitRule, peaks: np.ndarray) -> np.ndarray
 
 
 def best_opacities(opacity: float) -> np.ndarray:
-    """(2,) outer and middle peak opacity of the three children that minimise the error."""
+    """(2,) outer and middle peak opacity of the three children, chosen to minimise the error."""
 
     def residuals(logits: np.ndarray) -> np.ndarray:
         outer, middle = 1.0 / (1.0 + np.exp(-logits))

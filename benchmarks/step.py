@@ -1,13 +1,13 @@
-"""Effect of the choices inside a step, measured on every step of the pawn's jump.
+"""Effect of numerical choices inside a step, measured on every step of the pawn's jump.
 
 python benchmarks/step.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
 
-Three tables. Newton iterations: their number in the jump, and in the same steps repeated with the known activations,
-with the true and with the projected Hessian of the elements. Contact velocities: the difference between the velocities
-that are linearised for a step's activations and the solved ones, with the tangent at the rigid guess and at the
-predicted end (rms and largest over the loaded contacts of all steps, m/s; the pawn is 1 m tall). Factors: the time to
-factor a step's matrix and to solve for one right-hand side per muscle and contact row, with our factorisation and with
-SciPy's SuperLU. This benchmark has no aim.
+There are three tables. Newton iterations: their number in the jump, and in the same steps repeated with the known
+activations, with the true and with the projected Hessian of the elements. Contact velocities: the difference between
+the velocities linearised for a step's activations and the solved velocities, with the tangent at the rigid guess and at
+the predicted end (rms and maximum over the loaded contacts of all steps, m/s; the pawn is 1 m tall). Factors: the time
+to factor a step's matrix and to solve for one right-hand side per muscle and contact row, with our factorisation and
+with SciPy's SuperLU. This benchmark has no aim.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def memory_of(step: StepReport) -> WarmStart:
 
 
 def contact_errors(creature: Creature, before: StepReport, step: StepReport) -> dict[str, np.ndarray]:
-    """Return (3k,) m/s, the errors of the linearised velocities of the k loaded contacts, for each point of
+    """Return the errors (3k,), m/s, of the linearised velocities of the k loaded contacts, for each point of
     linearisation."""
     stepper, contacts, muscles = creature.stepper, step.contacts, creature.muscles
     problem = StepProblem(creature.body, before.state, step.dt)

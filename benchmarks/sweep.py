@@ -4,8 +4,8 @@ python benchmarks/sweep.py [--quick] [--workers 2] [--device cpu] [--seed 0] [--
 
 A run succeeds if the motion reaches its target (distance and height within 15 %, a twist's heading within 10 degrees
 and its drift within 0.1 body heights, a walk's distance within 10 % and the slip of its feet below 2 % of a stride),
-the body ends upright (tilt under 10 degrees) and the run passes the audit. Each failure is listed with its reason.
-Captures are used if they are on this machine (in ``EGS_WARP_DATA``, by default ../shared/data).
+the body ends upright (tilt below 10 degrees) and the run passes the audit. Each failure is listed with its reason.
+Captures are used if they are available on this machine (in ``EGS_WARP_DATA``, by default ../shared/data).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ BOUNDS = {
     "inverted_elements": 0,
     "newton_unconverged": 0,
 }
-"""Upper bounds of the audit of a success."""
+"""Upper bounds of the audit for a successful run."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def cases(quick: bool) -> list[Case]:
 
 
 def further(captures: Sequence[str]) -> list[Case]:
-    """Return runs at the default friction, sag and step size with other targets, slopes, scripts and sizes."""
+    """Return runs with other targets, slopes, scripts and sizes, at the default friction, sag and step size."""
 
     def default(body: str, motion: str, **rest: float) -> Case:
         return Case(body, motion, 0.8, DEFAULT_SAG, 1 / 60, **rest)
@@ -109,7 +109,8 @@ def further(captures: Sequence[str]) -> list[Case]:
 
 
 def run(case: Case, *, device: str, seed: int, frames: int | None = None) -> Row:
-    """Simulate the first ``frames`` frames of one case and judge it; ``seed`` is for the built-in bodies' Gaussians."""
+    """Simulate the first ``frames`` frames of one case and judge it; ``seed`` selects the Gaussians of built-in
+    bodies."""
     wp.config.log_level = wp.LOG_WARNING
     judged, milliseconds = timed(_run, case, device=device, seed=seed, frames=frames)
     return {**asdict(case), **judged, "seconds": 1e-3 * milliseconds}
@@ -163,7 +164,7 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
 
 
 def bounds_broken(checked: dict[str, float]) -> str | None:
-    """Return the first bound of the audit that a run breaks; None if it breaks none."""
+    """Return the first bound of the audit that a run exceeds; None if it exceeds none."""
     for name, bound in BOUNDS.items():
         if not checked[name] <= bound:
             return f"audit: {name} {checked[name]:.2g}"
@@ -171,7 +172,7 @@ def bounds_broken(checked: dict[str, float]) -> str | None:
 
 
 def judge(motion: str, requested: dict[str, float], reached: dict[str, float], *, metres: float = 1.0) -> str | None:
-    """Return why a motion of a body ``metres`` tall failed; None for a success."""
+    """Return the reason why a motion of a body ``metres`` tall failed; None for a success."""
     if reached["tilt_degrees"] >= 10.0:
         return f"fell or leans: tilt {reached['tilt_degrees']:.0f} degrees"
     if motion == "walk":
@@ -195,7 +196,7 @@ def judge(motion: str, requested: dict[str, float], reached: dict[str, float], *
 
 
 def friction_spent(trajectory: Trajectory) -> float:
-    """Return the fraction of the steps with contact whose friction force is within 1 % of its limit."""
+    """Return the fraction of the steps with contact in which the friction force is within 1 % of its limit."""
     normal = np.einsum("ci,ci->c", trajectory.contact_force, trajectory.contact_normal)
     tangential = np.linalg.norm(trajectory.contact_force - normal[:, None] * trajectory.contact_normal, axis=1)
     steps = len(trajectory.time) - 1
@@ -206,7 +207,7 @@ def friction_spent(trajectory: Trajectory) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the sweep."""
+    """Run all cases and print the summary."""
     parser = flags(__doc__, quick="three runs", device="cpu", seed="of the Gaussians of the built-in bodies")
     workers_flag(parser)
     parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")
@@ -233,7 +234,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def summary(rows: list[Row]) -> dict[str, Any]:
-    """Return success rates by every factor, worst audits of the successes, and the aims, as arguments of ``report``."""
+    """Return success rates by every factor, the worst audit values of the successes, and the aims, as arguments of
+    ``report``."""
     good = [row for row in rows if row["success"]]
     rates = {
         factor: {

@@ -1,22 +1,21 @@
-"""Table 1: methods of deforming Gaussians with a cage, against the truth of a deformed mesh.
+"""Table 1: methods of deforming Gaussians with a cage, compared with the true deformed mesh.
 
-Glossy objects with true meshes are photographed at rest by a ray caster, trained to Gaussians of SH degree 3 by the
-project's own trainer, and then bent, twisted and dropped on the floor: one displacement of the cage nodes, known or
-simulated, deforms both the mesh's vertices and the Gaussians. The gloss rotates with the surface, as in a capture, so
-the rotation of colour counts. Held-out cameras compare the two. Three objects make up the table; two more are held out.
-The settings of splitting were chosen on three others (``--choose``), which no table shows.
+Glossy objects with true meshes are photographed at rest by a ray caster and trained to Gaussians of SH degree 3 by the
+project's own trainer. Then they are bent, twisted and dropped on the floor: one displacement of the cage nodes, known
+or simulated, deforms both the mesh's vertices and the Gaussians. The gloss rotates with the surface, as in a capture,
+so the rotation of colour affects the result. Held-out cameras compare the two. The table contains three objects; two
+more are held out. The settings of splitting were chosen on three others (``--choose``), which appear in no table.
 
-Rows: SuGaR (bound to a surface of the capture, and once to the cage's faces), PhysGaussian, VR-GS; ours unsplit, with
-the paper's split (Eq. 17 as corrected), and with ours. Further rows compare equal numbers of Gaussians: the other
-methods deform the Gaussians that result from our split, and all methods, ours without splits, deform a capture trained
-with the same number.
+Rows: SuGaR (bound to a surface of the capture, and once to the cage's faces), PhysGaussian, VR-GS; our method unsplit,
+with the paper's split (Eq. 17 as corrected), and with our split. Further rows compare equal numbers of Gaussians: the
+other methods deform the Gaussians that result from our split, and all methods, ours without splits, deform a capture
+trained with the same number of Gaussians.
 
-Aims, from means over objects: ``best_psnr_every_deformation`` and ``best_ssim_every_deformation`` (ours ahead of all
-rows that start from the same capture), ``margin_over_vrgs`` (by at least the paper's margins), ``split_helps`` (ours
-ahead of ours unsplit in PSNR and SSIM for every deformation), ``equal_count_best`` (in PSNR and SSIM for every
-deformation, ours ahead of the others on its split, and ours unsplit ahead of them on the capture trained with the same
-number),
-``paper_margins_held_out`` (the paper's margins over VR-GS on the two held-out objects).
+Aims, from means over objects: ``best_psnr_every_deformation`` and ``best_ssim_every_deformation`` (our method ahead of
+all rows that start from the same capture), ``margin_over_vrgs`` (by at least the paper's margins), ``split_helps`` (our
+method ahead of itself without splits in PSNR and SSIM for every deformation), ``equal_count_best`` (in PSNR and SSIM
+for every deformation, our method ahead of the others on its split, and our unsplit method ahead of them on the capture
+trained with the same number), ``paper_margins_held_out`` (the paper's margins over VR-GS on the two held-out objects).
 """
 
 from __future__ import annotations
@@ -38,27 +37,28 @@ from table1_rows import MAIN, MOTIONS, ROWS, SAME_SPLIT, SAME_TRAINING, Splittin
 OBJECTS = ("chair", "plant", "microphone")
 HELD_OUT = ("spot", "stool")
 FROM_PHOTOS = "lego"
-"""Proxy of the NeRF-synthetic model, built from its photos (``lego_proxy.py``); evaluated only on request, and part of
-no aim."""
+"""Proxy of the NeRF-synthetic model, built from its photos (``lego_proxy.py``). It is evaluated only on request and
+affects no aim."""
 CHOOSING = ("cat", "vase", "table")
 """Objects on which the settings below were chosen."""
 DEGREES, MIN_ERROR, DEPTH, GROWTH = 4.0, 7e-4, 4, 20.0
-"""Result of --choose with images of 256 x 256 and 3000 training steps; the first two are the library's defaults."""
+"""Result of ``--choose`` with images of 256 x 256 and 3000 training steps; the first two values are the library's
+defaults."""
 SETTINGS = {
     f"{degrees:g} degrees, {error:g}": (degrees, error)
     for error, degrees in product((7e-4, 4e-4, 2e-4, 1e-4), (9.0, 4.0))
 }
-"""Settings that --choose compares, the coarsest first."""
+"""Settings that ``--choose`` compares, the coarsest first."""
 PSNR_TOLERANCE = 0.02
-"""Tolerance of --choose, dB: it selects the coarsest setting whose mean PSNR over objects and motions is this close to
-the best."""
+"""Tolerance of ``--choose``, dB: it selects the coarsest setting whose mean PSNR over objects and motions differs from
+the best by at most this value."""
 PAPER_MARGINS = {"bend": (0.16, 0.006), "twist": (0.36, 0.017), "fall": (0.36, 0.013)}
-"""Margins of the paper's full method over its VR-GS row, PSNR (dB) and SSIM."""
+"""Margins of the paper's full method over the VR-GS row in the paper's Table 1, PSNR (dB) and SSIM."""
 SCORES = ("psnr", "ssim", "flip")
 
 
 def means(rows: list[Row], objects: Sequence[str]) -> dict[tuple[str, str], tuple[float, ...]]:
-    """Return PSNR, SSIM, FLIP and number of Gaussians over ``objects`` for each motion and row."""
+    """Return the means of PSNR, SSIM, FLIP and number of Gaussians over ``objects``, for each motion and row."""
     table = {}
     for motion, name in product(MOTIONS, ROWS):
         chosen = [r for r in rows if (r["motion"], r["row"]) == (motion, name) and r["object"] in objects]
@@ -149,7 +149,7 @@ def choose(options: argparse.Namespace) -> list[Row]:
 
 
 def selected_setting(rows: list[Row]) -> str:
-    """Return the setting that the rule of --choose selects from its rows."""
+    """Return the setting that ``--choose`` selects from its rows."""
     averages = {
         name: np.mean([row["psnr"] for row in rows if row["setting"] == name])
         for name in SETTINGS

@@ -31,16 +31,15 @@ from perceptual import flip_error, lpips_distance
 
 MOTIONS = ("bend", "twist", "fall")
 CAGE_NODES = {"plant": 2000, "microphone": 500}
-"""Number of cage nodes by object, otherwise 1000: enough for the cage to contain the whole mesh, including thin leaves,
-because the deformation is not defined outside the cage.
-"""
+"""Number of cage nodes by object, otherwise 1000. The cage must contain the whole mesh, including thin leaves, because
+the deformation is not defined outside the cage."""
 ON_LEGS, ON_LEAVES = (0.15, 0.6, 20.0), (0.3, 0.8, 150.0)
-"""Sag, height (m) and tilt (degrees) of a fall; the plant falls on its leaves."""
+"""Sag, height (m) and tilt (degrees) of a fall onto the legs and of a fall onto the leaves; the plant falls onto its
+leaves."""
 FLOOR = Plane.from_coefficients(0.0, 0.0, 1.0, 0.0)
 AS_TRAINED, SPLIT, PAPER_SPLIT, AS_MANY = "as trained", "our split", "the paper's split", "trained with as many"
-"""Captures: as trained, two splits of it for the motion, and one trained with as many Gaussians as our split has on
-average over the motions.
-"""
+"""Captures: as trained; two splits of the trained capture for the motion; and a capture trained with the mean number of
+Gaussians that our split has over the motions."""
 PAPER_DEGREES = 9.0
 """The paper's 15 degrees between arms of 3 standard deviations, converted to arms of sqrt 3."""
 
@@ -52,7 +51,7 @@ class TableRow:
     capture: str
     method: DeformationMethod
     on_cage: bool = False
-    """True if ``SURFACE`` binds to the cage's own faces, not to a surface of the capture."""
+    """True if ``SURFACE`` binds to the cage's own faces instead of a surface of the capture."""
     rotates_colour: bool = True
 
 
@@ -69,7 +68,7 @@ MAIN = {
     "ours": TableRow(SPLIT, WHOLE),
 }
 SAME_SPLIT = {f"{name}, our split": TableRow(SPLIT, method) for name, method in BASELINES.items()}
-"""Rows that deform the same Gaussians as "ours": their number and the image at rest are equal."""
+"""Rows that deform the same Gaussians as the row "ours", so that their number and the image at rest are equal."""
 SAME_TRAINING = {
     **{f"{name}, as many": TableRow(AS_MANY, method) for name, method in BASELINES.items()},
     "ours, no split, as many": TableRow(AS_MANY, WHOLE),
@@ -115,14 +114,14 @@ class Subject:
 
     def __init__(self, mesh: PaintedMesh, options: argparse.Namespace) -> None:
         self.mesh, self.options = replace(mesh, glossy=not options.matt), options
-        # The cage is built from the surface, not from a trained cloud, so that it and the fall are the same for every
-        # training.
+        # Build the cage from the surface instead of a trained cloud, so that the cage and the fall are the same for
+        # every training.
         self._surface = scenes.surface_cloud(mesh, 40_000, device="cpu")
         self.cage = build_cage(self._surface, FLOOR, target_nodes=options.nodes or CAGE_NODES.get(mesh.name, 1000)).mesh
 
     @cached_property
     def photos(self) -> list[TrainingView]:
-        """Training views."""
+        """Photographs of the mesh at rest, for training."""
         return scenes.photographs(self.mesh, self.options.size, self.options.views, self.options.device)
 
     def moved_nodes(self) -> dict[str, np.ndarray]:
@@ -168,7 +167,7 @@ class Subject:
         return cloud
 
     def views(self, vertices: np.ndarray) -> list[View]:
-        """Render held-out images of the mesh with its vertices at ``vertices``: the truth."""
+        """Render held-out images of the mesh with its vertices at ``vertices`` (V, 3), the ground truth."""
         options = self.options
         cameras = scenes.ring(vertices, options.judges, options.size, elevations=(10.0, 40.0), phase=0.37)
         photos = scenes.photograph(self.mesh, vertices, cameras, options.device)
@@ -185,9 +184,9 @@ class View:
 
     camera: Camera
     picture: np.ndarray
-    """(H, W, 3) colour."""
+    """(H, W, 3) colour of the image."""
     coverage: np.ndarray
-    """(H, W) coverage."""
+    """(H, W) fraction of each pixel that the mesh covers."""
 
     def judge(self, cloud: GaussianCloud) -> tuple[dict[str, float], np.ndarray]:
         """Return the scores of the cloud's image, and that image."""

@@ -1,21 +1,22 @@
-"""Table 2: number of quadratic programs and objective of every strategy for the contact states, frame by frame.
+"""Table 2: number of quadratic programs and objective for every search over contact states, frame by frame.
 
 python benchmarks/table2.py [--quick] [--device cpu] [--seed 0] [--solver daqp] [--bodies pawn stool monkey]
     [--json PATH] [--plot PATH]
 
-The paper's protocol: 50 frames animated with known activations, 10 muscle groups and 5 contacts of 8 friction
-directions, that is 60 variables and 50 complementarity pairs a frame. Each frame is one program (Eq. 13) whose target
-is the animation's own motion; every strategy gets the same programs. A second table has smaller problems of the same
-bodies, and random ones, compared with the optimum over all contact states (branch and bound).
+The paper's protocol: 50 frames animated with known activations, 10 muscle groups and 5 contacts with 8 friction
+directions, which gives 60 variables and 50 complementarity pairs per frame. Each frame is one program (Eq. 13) whose
+target is the animation's own motion; every strategy gets the same programs. A second table has smaller problems of the
+same bodies, and random problems, whose results are compared with the optimum over all contact states (branch and
+bound).
 
-``modes``, the default of the engine, has the exact friction cone. All others, including ``exact``, have the pyramid, so
+``modes``, the engine's default, uses the exact friction cone. All others, including ``exact``, use the pyramid, so
 ``modes`` may be better than ``exact``. ``modes`` and ``paper`` have activations as their only unknowns. ``objective``
-is the program's, at the activations and forces that a strategy returns; ``true`` is the same objective with the contact
-forces of the exact cone under its activations, which is what a step then computes. ``paper`` is the paper's: the states
-of stage 1 (Eq. 12), then one contact at a time. ``qpcc`` starts from all-static and changes one contact at a time by
-its own multipliers; if all-static has no solution, it starts from the states that follow from the last activations.
-``qpcc-our-moves`` differs from ``qpcc`` only in that it changes contacts by our rules, so that rules and start can be
-judged separately.
+is the program's objective at the activations and forces that a strategy returns. ``true`` is the same objective with
+the forces of exact contact under these activations, which a step then computes. ``paper`` is the paper's strategy: the
+states of stage 1 (Eq. 12), then changes of one contact at a time. ``qpcc`` starts from all-static and changes one
+contact at a time by the contact's own multipliers; if all-static has no solution, it starts from the states that follow
+from the last activations. ``qpcc-our-moves`` differs from ``qpcc`` only in that it changes contacts by our rules, so
+that the effects of rules and start can be separated.
 
 The ratios of ``exact`` to ``qpcc`` are also reported; they bound the possible gain. Aims, over all frames together:
 ``qps_vs_qpcc`` (``modes`` takes at most 0.37 of qpcc's QPs) and ``objective_vs_qpcc`` (its mean objective is at most
@@ -76,14 +77,14 @@ def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[Se
 
 
 def with_exact_forces(frame: Frame, x: np.ndarray) -> np.ndarray:
-    """(m + 3n,) activations of ``x`` (m + 3n,) and the forces of exact contact under them."""
+    """(m + 3n,) activations of ``x`` (m + 3n,), and the forces of exact contact under these activations."""
     program = frame.program
     activations, forces = np.split(x, [program.activation_count])
     return np.concatenate([activations, contact_forces(program, activations, forces).ravel()])
 
 
 def contact_forces(program: CoulombProgram, activations: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """(n, 3) body weights, the contact forces that satisfy the contact laws under ``activations`` (m,)."""
+    """(n, 3) contact forces, body weights, that satisfy the contact laws under ``activations`` (m,)."""
     m, n = program.activation_count, program.contact_count
     free = program.rows[:, :m] @ activations + program.offset
     delassus = program.rows[:, m:].copy()
@@ -135,7 +136,7 @@ def table_rows(table: str, body: str, results: dict[Search, np.ndarray], **more:
 
 
 def print_rows(rows: list[Row]) -> None:
-    """Print QPs and objectives (average, best, worst), milliseconds, and the ratio of the objective to the optimum."""
+    """Print QPs and objectives (mean, best, worst), milliseconds, and the ratio of the objective to the optimum."""
     table = Table(
         **{"body": "<12", "strategy": "<14", "frames": "d"},
         **{"QPs_avg": ".2f", "QPs_best": "d", "QPs_worst": "d"},
@@ -157,7 +158,8 @@ def pooled(parts: list[dict[Search, np.ndarray]]) -> dict[Search, np.ndarray]:
 
 
 def random_frames(count: int, seed: int) -> list[Frame]:
-    """Return random programs of three contacts, whose optimum without complementarity is far from the true one."""
+    """Return random programs with three contacts, whose optimum without complementarity is far from the true
+    optimum."""
     frames = []
     for index in range(count):
         program = small_problem(1000 * seed + index, contacts=3).coulomb

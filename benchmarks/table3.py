@@ -1,14 +1,14 @@
 """Table 3 of the paper: an object cut at its plane, viewed from within the plane. Also writes the paper's figure 9.
 
-Scenes are segmented as in ``egs-warp segment``, from masks in 18 views: of the true object in the built-in scenes, and
-of the object that a click selects in real captures. ``mask only`` is everything that the masks claim, without the
-plane. Four cameras of 800 x 800 pixels lie in the plane, so that its horizon is the middle row. PSNR and SSIM compare
-the upper halves with those of ``mask only``, on black; the residual is the sum of the pixels of the lower half
-divided by that of the upper half.
+Scenes are segmented as by ``egs-warp segment``, from masks in 18 views: masks of the true object in the built-in
+scenes, and of the object that a click selects in real captures. ``mask only`` contains everything that the masks claim,
+without regard to the plane. Four cameras of 800 x 800 pixels lie in the plane, so that its horizon is the middle row.
+PSNR and SSIM compare the upper halves with the upper halves of ``mask only``, on black. The residual is the sum of the
+pixels in the lower half divided by their sum in the upper half.
 
 Aims: ``residual`` (L_seg: at most 0.002 in every scene), ``psnr`` (L_seg: at least 35.3 dB in every scene). ``L_seg, no
-subdivision`` is the paper's own method; ours splits large straddling Gaussians before training, and cuts the remaining
-ones.
+subdivision`` is the paper's own method; our method splits large straddling Gaussians before training, and cuts the
+remaining straddling ones.
 """
 
 from __future__ import annotations
@@ -64,7 +64,8 @@ class Parts:
 
 
 def segment_parts(name: str, device: str) -> Parts:
-    """Segment the scene from masks in 18 views: of the truth in built-in scenes, of a click's object in captures."""
+    """Segment the scene from masks in 18 views: masks of the true object in built-in scenes, of a click's object in
+    captures."""
     if name in BUILT_IN:
         built = scene(name, device=device)
         cloud, chosen = built.whole()
@@ -90,15 +91,15 @@ def cameras_in(plane: Plane, located: LocatedPlane, side: int) -> list[Camera]:
 
 
 def picture(cloud: GaussianCloud, camera: Camera) -> np.ndarray:
-    """(H, W, 3) float32, 0 to 1, on black."""
+    """(H, W, 3) float32, 0 to 1: render of ``cloud`` on black."""
     return np.clip(render_gaussians(cloud, camera, background=BLACK).colour.numpy(), 0.0, 1.0)
 
 
 def scores(pictures: Sequence[np.ndarray], targets: Sequence[np.ndarray] | None) -> dict[str, float | None]:
     """Return the scores of images against the upper halves ``targets``.
 
-    ``targets`` is None for the images that they were taken from. ``whole_psnr`` compares the whole image with that
-    upper half above an empty lower half, so it combines residual and similarity.
+    ``targets`` is None for the images that define the targets. ``whole_psnr`` compares the whole image with the upper
+    half of the target above an empty lower half, so it combines residual and similarity.
     """
     half = len(pictures[0]) // 2
     residual = float(np.mean([one[half:].sum() / one[:half].sum() for one in pictures]))

@@ -1,8 +1,8 @@
-"""Accuracy of the remaining time that the progress bars of a scene and of a simulation show.
+"""Accuracy of the remaining time in the progress bars of a segmentation and of simulations.
 
 The built-in pawn is segmented from its scene, and jumps, hops, twists and walks. At each update of the bar, the
-remaining time that it shows is compared with the true remaining time, if that is at least 5 s, because the bar shows
-whole seconds.
+displayed remaining time is compared with the true remaining time, if that is at least 5 s, because the bar shows whole
+seconds.
 
 python benchmarks/time_left.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
 """
@@ -37,7 +37,7 @@ MIN_REMAINING = 5.0
 
 
 class Watched(io.StringIO):
-    """A stream that records, for each update of the bar, its time and the remaining seconds shown."""
+    """Stream that records, for each update of the bar, the time of the update and the displayed remaining seconds."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -52,7 +52,7 @@ class Watched(io.StringIO):
 
 
 def measured(name: str, run: Callable[[TextIO], int]) -> Row:
-    """Measure ``run``, which draws its progress bar on the given stream and returns its number of frames."""
+    """Measure ``run``, which draws its progress bar on the given stream and returns a number of frames."""
     stream = Watched()
     began = time.perf_counter()
     frames = run(stream)

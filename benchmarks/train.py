@@ -1,9 +1,9 @@
 """Captures trained from real photos by our trainer and by gsplat's MCMC strategy: held-out PSNR and SSIM, and time.
 
-Both get the same photos (undistorted, every eighth held out), the same iterations and the same cap on Gaussians, and
-are judged with the same renderer: once without and once with an affine colour correction fitted to each whole held-out
-photo, the common method to remove differences in exposure. The means include every held-out photo, even one with a
-wrong pose.
+Both get the same photos (undistorted, every eighth held out), the same number of iterations and the same cap on
+Gaussians. Both are evaluated with the same renderer, without and with an affine colour correction fitted to each whole
+held-out photo, the common method to remove differences in exposure. The means include every held-out photo, even photos
+with a wrong pose.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _SHOWN = (
     *("case", "method", "gaussians", "seconds", "held_out_psnr", "held_out_ssim"),
     *("held_out_plain_psnr", "held_out_plain_ssim", "trained_on_psnr", "trained_on_ssim"),
 )
-"""Columns of the table, by their keys in the rows."""
+"""Columns of the table, as keys of the rows."""
 _WARM_UP = 20
 """Number of training steps of both trainers before the first timed case, to compile the kernels."""
 
@@ -79,7 +79,8 @@ def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list
             seed=options.seed,
             device=options.device,
         )
-        # Each is judged on its training background: on another, the light that it transmits would count as an error.
+        # Render each capture on its training background: on another background, the light that it transmits would be an
+        # error.
         behind = result.background if result.cut_out else (0.0, 0.0, 0.0)
         scores = [
             score_photo(peer.cloud, view, behind, held_out=score.held_out)

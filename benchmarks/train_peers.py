@@ -53,11 +53,11 @@ def train_with_gsplat(
     seed: int = 0,
     device: str = "cuda:0",
 ) -> PeerResult:
-    """Train with gsplat 1.5.3, set up as in its ``simple_trainer.py mcmc``, with only the cap of the strategy changed.
+    """Train with gsplat 1.5.3, set up as in its ``simple_trainer.py mcmc``; only the cap of the strategy is changed.
 
-    The world is scaled to the cameras; training starts from triangulated points or a random cube; the SH degree rises
-    by one every 1,000 steps; the background is black. Photos with alpha are composited over a random colour in each
-    step, as in our trainer; SSIM is ``metrics.ssim``, because fused_ssim is a separate package.
+    The world is scaled to the cameras. Training starts from triangulated points or a random cube, the SH degree rises
+    by one every 1,000 steps, and the background is black. Photos with alpha are composited over a random colour in each
+    step, as in our trainer. SSIM is ``metrics.ssim``, because fused_ssim is a separate package.
     """
     from gsplat import rasterization  # type: ignore[import-not-found]
     from gsplat.strategy import MCMCStrategy  # type: ignore[import-not-found]

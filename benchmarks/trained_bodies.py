@@ -1,4 +1,4 @@
-"""Captures of meshes for ``gaits.py --captures``, trained by the package from photographs of a ray caster.
+"""Captures of meshes for ``gaits.py --captures``, trained by this package from photographs of a ray caster.
 
 python benchmarks/trained_bodies.py [--quick] [--device cpu] [--seed 0] [--names NAME ...] [--out FOLDER] [--json PATH]
 

@@ -1,4 +1,4 @@
-"""Write the built-in objects and scenes as captures to try the commands on: each object alone, and in its room."""
+"""Write the built-in objects and scenes as captures for trying the commands: each object alone, and in its room."""
 
 from __future__ import annotations
 

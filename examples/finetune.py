@@ -1,7 +1,7 @@
-"""Interoperation with PyTorch: the lost colours of a pawn are recovered from images, with gradients from pixels to
-Gaussians.
+"""Interoperation with PyTorch: recover the lost colours of a pawn from images, by gradients from pixels to Gaussians.
 
-The renderer is an ordinary differentiable torch function (``render_torch``); ``finetune`` is the loop around it.
+The renderer is an ordinary differentiable torch function (``render_torch``), and ``finetune`` is a training loop around
+it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Read the file that ``egs-warp export RUN --to bundle`` writes; needs only numpy (docs/concepts/bundle.md)."""
+"""Read a file that ``egs-warp export RUN --to bundle`` has written; needs only NumPy (docs/concepts/bundle.md)."""
 
 import json
 import sys
@@ -36,9 +36,10 @@ class Bundle:
         return np.array(entry["lower"]) + np.array(entry["step"]) * stored if "step" in entry else stored
 
     def frame(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return means (n, 3), covariances and rotations R (n, 3, 3); colour along d is that of ``bands`` along d @ R.
+        """Return means (n, 3), covariances (n, 3, 3) and rotations R (n, 3, 3) of the splats in frame ``index``.
 
-        A tetrahedron maps a row vector v to v @ map.
+        The colour in direction d is the value of ``bands`` in direction d @ R. A tetrahedron maps a row vector v to v @
+        map.
         """
         a, tet, rows = self.arrays, self.arrays["tets"], np.flatnonzero(self.arrays["carriers"] == 1)
         moved = self.nodes[index][a["cage_tets"]]
@@ -47,7 +48,7 @@ class Bundle:
         own = np.where(a["carriers"][:, None, None] == 2, turns, maps[tet])
         means = moved[tet, 0] + _apply(a["means"] - self.corners[tet, 0], own)
         axes, signs = self.axes @ own, np.repeat([1.0, -1.0], 3)[:, None]
-        end = a["arm_tets"] + tet[rows, None].astype(a["arm_tets"].dtype)  # (r, 6): the ends + + + - - - of the axes
+        end = a["arm_tets"] + tet[rows, None].astype(a["arm_tets"].dtype)  # (r, 6): axis ends, order + + + - - -
         inner = signs * np.tile(axes[rows], (1, 2, 1))
         outer = signs * _apply(np.tile(self.axes[rows], (1, 2, 1)), maps[end])
         image = moved[end, 0] + _apply(a["means"][rows, None] - self.corners[end, 0], maps[end])

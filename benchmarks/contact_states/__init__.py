@@ -1,1 +1,1 @@
-"""Searches over contact states from the literature, with which ``table2.py`` compares the engine's."""
+"""Searches over contact states from the literature; ``table2.py`` compares them with the engine's search."""

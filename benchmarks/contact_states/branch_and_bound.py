@@ -21,7 +21,7 @@ class _Decided(Enum):
     SEPARATE = "separate"
     STATIC = "static"
     ARC = "arc"
-    """The contact slides in one direction of a range."""
+    """The contact slides in one of a range of directions."""
     SLIDE = "slide"
     """The contact slides in the given direction."""
 
@@ -31,14 +31,15 @@ _LEAVES = (_Decided.SEPARATE, _Decided.STATIC, _Decided.SLIDE)
 
 @dataclass(frozen=True)
 class _Branch:
-    """Decision about one contact; if it slides, ``first`` to ``last`` are its possible directions in the ring."""
+    """Decision about one contact. For a sliding contact, ``first`` to ``last`` are its possible directions, as indices
+    in the ring."""
 
     decided: _Decided = _Decided.NOTHING
     first: int = 0
     last: int = 0
 
     def children(self, directions: int) -> list[_Branch]:
-        """Return branches that together contain every state of this one."""
+        """Return branches that together contain every state of this branch."""
         if self.decided is _Decided.NOTHING:
             half = directions // 2
             return [
@@ -48,8 +49,8 @@ class _Branch:
                 _Branch(_Decided.ARC, half, directions),
             ]
         if self.decided is _Decided.ARC and self.last - self.first > 1:
-            # Friction is along one edge of the pyramid or on a face between two, so the halves share only the middle
-            # edge.
+            # Friction acts along one edge of the pyramid or on a face between two edges, so the halves share only the
+            # middle edge.
             middle = (self.first + self.last) // 2
             return [replace(self, last=middle), replace(self, first=middle)]
         if self.decided is _Decided.ARC:
@@ -63,12 +64,12 @@ class _Branch:
 
 @dataclass(frozen=True)
 class ExactResult:
-    """Best point and the lower bound that was proved."""
+    """Best point that was found, and the lower bound that was proved."""
 
     y: np.ndarray
-    """(variables,)."""
+    """(variables,) unknowns of ``PyramidProgram``."""
     states: np.ndarray
-    """(n,) contact states."""
+    """(n,) contact states of the best point."""
     objective: float
     bound: float
     """Lower bound on the objective of all contact states."""
@@ -76,7 +77,8 @@ class ExactResult:
 
     @property
     def proved(self) -> bool:
-        """True if the objective equals its lower bound to within 1e-6, so that no contact states have a lower one."""
+        """True if the objective equals its lower bound to within 1e-6, so that no contact states have a lower
+        objective."""
         return self.objective - self.bound <= 1e-6 * (1.0 + abs(self.objective))
 
 
@@ -89,12 +91,12 @@ def exact_states(
 ) -> ExactResult | None:
     """Find the global optimum of ``program``.
 
-    Each node relaxes the undecided pairs to 0 <= x, 0 <= w; this convex QP bounds the objective of all its states from
-    below.
+    Each node of the tree relaxes the undecided pairs to 0 <= x, 0 <= w. The optimum of this convex QP bounds the
+    objective of all states in the node from below.
 
     Args:
         program: the QP with a friction pyramid.
-        starts: states (n,) that are tried first; good ones prune most of the tree.
+        starts: states (n,) that are tried first; good states prune most of the tree.
         qp_limit: maximum number of QPs.
         relative_gap: the search ends when no node can lower the best objective by more than 1e-7 or, if that is larger,
             by more than this fraction of it.

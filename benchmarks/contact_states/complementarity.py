@@ -26,12 +26,13 @@ class Pivot(NamedTuple):
     """Magnitude of the multiplier that proposes the move."""
     contact: int
     state: int
-    """New state."""
+    """Proposed new state of the contact."""
 
 
 @dataclass(frozen=True)
 class ContactLayout:
-    """Layout of the unknowns y = (a, f_n, f_t, lambda) and of the rows (y, c, D^T u' + E lambda, mu f_n - E^T f_t)."""
+    """Layout of the unknowns y = (a, f_n, f_t, lambda) and of the rows (y, c, D^T u' + E lambda, mu f_n - E^T f_t) of
+    Eq. (9)."""
 
     activations: int
     """Number of activations M."""
@@ -57,11 +58,11 @@ class ContactLayout:
 
     @property
     def slip(self) -> slice:
-        """Slice of lambda."""
+        """Slice of the slip variables lambda."""
         return slice(self.tangent.stop, self.variables)
 
     def paired(self, part: slice) -> slice:
-        """Return the rows of w that are complementary to the slice ``part`` of x."""
+        """Return the rows of w that are complementary to the unknowns in the slice ``part``."""
         shift = self.variables - self.activations
         return slice(part.start + shift, part.stop + shift)
 
@@ -77,7 +78,7 @@ class ContactLayout:
         return free
 
     def bounds(self, states: np.ndarray, lowest: np.ndarray, highest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower and upper bounds of all rows: each of ``states`` (n,) fixes one side of each pair to zero, and
+        """Return lower and upper bounds of all rows. Each of the ``states`` (n,) fixes one side of each pair to zero;
         the activations are between ``lowest`` and ``highest`` (M,)."""
         lower = np.zeros(2 * self.variables - self.activations)
         upper = np.full_like(lower, np.inf)
@@ -95,18 +96,19 @@ class ContactLayout:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Both sides of the pairs of Eq. (9), 0 <= x and 0 <= w with x w = 0, by contact; or their rows' multipliers."""
+    """Both sides of the pairs of Eq. (9), 0 <= x and 0 <= w with x w = 0, by contact; or the multipliers of their
+    rows."""
 
     normal: np.ndarray
-    """(n,) x: f_n."""
+    """(n,) x: normal forces f_n."""
     friction: np.ndarray
-    """(n, n_d) x: f_t along each D."""
+    """(n, n_d) x: friction forces f_t along each of the directions D."""
     slip: np.ndarray
-    """(n,) x: lambda."""
+    """(n,) x: slip variables lambda."""
     gap: np.ndarray
     """(n,) w of ``normal``: the normal measure c."""
     drift: np.ndarray
-    """(n, n_d) w of ``friction``: D^T u' + lambda."""
+    """(n, n_d) w of ``friction``: D^T u' + E lambda."""
     cone: np.ndarray
     """(n,) w of ``slip``: mu f_n minus the sum of f_t."""
 
@@ -119,9 +121,9 @@ class Pairs:
 
     @property
     def violation(self) -> np.ndarray:
-        """(n,) complementarity violation of each contact: the smaller side of a pair, maximum over the contact's pairs.
+        """(n,) complementarity violation of each contact, the maximum over its pairs of the smaller side.
 
-        Zero where Eq. (9) holds.
+        It is zero where Eq. (9) is satisfied.
         """
         normal, slip = np.minimum(self.normal, self.gap), np.minimum(self.slip, self.cone)
         return np.maximum(np.maximum(normal, slip), np.minimum(self.friction, self.drift).max(axis=1))
@@ -167,8 +169,8 @@ def proposed_pivots(
         states: (n,) current states.
         x: (pairs,) left sides of Eq. (9), from ``PyramidProgram.pairs``.
         w: (pairs,) right sides of Eq. (9), from ``PyramidProgram.pairs``.
-        multipliers: (rows,) multipliers of all rows; only those of rows fixed to zero are used.
-        zero: values of x, w and the multipliers up to this count as zero.
+        multipliers: (rows,) multipliers of all rows; only the multipliers of rows fixed to zero are used.
+        zero: values of x, w and the multipliers that are not larger than this are treated as zero.
     """
     point, multiplier = Pairs.of(layout, x, w), _multipliers(layout, multipliers)
     pivots: list[Pivot] = []
@@ -184,7 +186,7 @@ def proposed_pivots(
 
 
 def _multipliers(layout: ContactLayout, multipliers: np.ndarray) -> Pairs:
-    """Split the multipliers (rows,) as the pairs of their rows."""
+    """Split the multipliers (rows,) into the multipliers of the two rows of each pair."""
     return Pairs.of(layout, multipliers[layout.activations : layout.variables], multipliers[layout.variables :])
 
 
@@ -201,7 +203,7 @@ def _moves_of_separate(i: int, point: Pairs, multiplier: Pairs, zero: float) -> 
 
 def _moves_of_static(i: int, point: Pairs, multiplier: Pairs, zero: float, nd: int) -> _Moves:
     table = tangent_directions(nd)
-    # The rows of a static contact are redundant, so only the sum of their multipliers along D is defined.
+    # The rows of a static contact are linearly dependent, so only the sum of their multipliers along D is determined.
     gradient = multiplier.drift[i] @ table
     size = float(np.linalg.norm(gradient))
     if point.normal[i] <= zero:
@@ -249,7 +251,7 @@ def plain_pivots(
 ) -> list[Pivot]:
     """Propose changes of state like the pivots of a QPCC, as the baseline: each multiplier is judged alone.
 
-    The arguments are those of ``proposed_pivots``.
+    The arguments are the same as for ``proposed_pivots``.
 
     A contact whose free side is zero changes to the state in which the row of the multiplier is free: static to
     separate or slide k, slide k to static, separate or slide j, separate to static.

@@ -23,7 +23,7 @@ def lemke(matrix: np.ndarray, q: np.ndarray, *, pivot_limit: int = 2000) -> np.n
     count = len(q)
     if count == 0 or q.min() >= 0.0:
         return np.zeros(count)
-    # Columns: w (n), z (n), the covering variable, the right-hand side. w - M z - e z0 = q.
+    # Columns: w (n), z (n), the covering variable, the right-hand side, for w - M z - e z0 = q.
     tableau = np.asfortranarray(np.hstack([np.eye(count), -matrix, -np.ones((count, 1)), q[:, None]]))
     basis = np.arange(count)
     scale = 1e-11 * max(1.0, float(np.abs(matrix).max()))
@@ -41,7 +41,7 @@ def lemke(matrix: np.ndarray, q: np.ndarray, *, pivot_limit: int = 2000) -> np.n
         column = tableau[:, entering]
         usable = np.flatnonzero(column > scale)
         if len(usable) == 0:
-            # A secondary ray; if the covering variable has already vanished, this point is the solution.
+            # This is a secondary ray. If the covering variable has already vanished, the point is the solution.
             return _solution(tableau, basis) if tableau[basis == 2 * count, -1].item() < 1e-11 else None
         row = _smallest_ratio(tableau, column, usable, basis, 2 * count)
     return None
@@ -56,7 +56,8 @@ def _solution(tableau: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def _smallest_ratio(tableau: np.ndarray, column: np.ndarray, rows: np.ndarray, basis: np.ndarray, cover: int) -> int:
-    """Return the row of the smallest ratio; in a tie, that of the covering variable, else the lexicographic minimum."""
+    """Return the row with the smallest ratio; in a tie, the row of the covering variable, else the lexicographic
+    minimum."""
     count = len(tableau)
     for index in (-1, *range(count)):
         ratios = tableau[rows, index] / column[rows]

@@ -15,29 +15,29 @@ from egs_warp.contact.detection import tangent_directions
 from egs_warp.locomotion.contact_modes import CoulombProgram
 
 _REGULARIZATION = 1e-7
-"""Added to the diagonal of P, which is singular in the pyramid forces."""
+"""Value added to the diagonal of P, which is singular in the pyramid forces."""
 
 
 @dataclass(frozen=True)
 class PyramidProgram:
     """QP min 1/2 y^T P y + q^T y + constant over y = (a, f_n, f_t, lambda), subject to the pairs of Eq. (9).
 
-    The rows A y + offset are those of ``ContactLayout``; contact states change only their bounds. Units: activations
-    are fractions of their bounds, forces in body weights, speeds in sqrt(g H).
+    The rows A y + offset are the rows of ``ContactLayout``; contact states change only their bounds. Units: activations
+    are fractions of their bounds, forces are in body weights, velocities in sqrt(g H).
     """
 
     layout: ContactLayout
     friction: float
     P: np.ndarray
-    """(variables, variables)."""
+    """(variables, variables) Hessian of the objective."""
     q: np.ndarray
-    """(variables,)."""
+    """(variables,) linear term of the objective."""
     constant: float
-    """Constant that completes the objective to the sum of weighted squares, which is never negative."""
+    """Constant with which the objective equals the sum of weighted squares, which is never negative."""
     A: np.ndarray
-    """(rows, variables)."""
+    """(rows, variables) matrix of the constraint rows."""
     offset: np.ndarray
-    """(rows,)."""
+    """(rows,) constant of the constraint rows."""
     lower: np.ndarray
     """(M,) lower bounds of the activations."""
     upper: np.ndarray
@@ -76,7 +76,8 @@ class PyramidProgram:
 
 
 def _spread(layout: ContactLayout) -> sparse.csr_matrix:
-    """Return the matrix (M + 3n, variables) from y to activations and contact forces (normal and two tangential)."""
+    """Return the matrix (M + 3n, variables) that maps y to activations and contact forces (one normal and two
+    tangential components)."""
     m, n, nd = layout.activations, layout.contacts, layout.directions
     spread = np.zeros((m + 3 * n, layout.variables))
     spread[np.arange(m), np.arange(m)] = 1.0

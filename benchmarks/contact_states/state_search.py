@@ -1,4 +1,4 @@
-"""Searches over contact states with a friction pyramid, with which the engine's strategies are compared (Eq. 13).
+"""Searches over contact states with a friction pyramid, to be compared with the engine's strategies (Eq. 13).
 
 See docs/benchmarks/contact.md#searches.
 """
@@ -29,17 +29,17 @@ from egs_warp.locomotion.paper_strategy import predicted_modes
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, QuadraticProgram, quadratic_program
 
 STOP_GAP = 1.005
-"""A search over states ends if the objective is within this factor of its lower bound."""
+"""A search ends if the objective is at most this factor times its lower bound."""
 RESTART_GAP = 1.2
-"""A search restarts from other states, with ``RESTART_BUDGET`` times as many QPs, if the objective exceeds its lower
-bound by more than this factor."""
+"""A search restarts from other states, with ``RESTART_BUDGET`` times as many QPs, if the objective is more than this
+factor times its lower bound."""
 NEGLIGIBLE_GAIN = 0.01
-"""Fraction of the cost of doing nothing (no muscle and no contact forces); a search that could gain less does not
-restart."""
+"""Fraction of the cost of doing nothing (no muscle forces and no contact forces). A search that could gain less does
+not restart."""
 LOADED_FORCE = 1e-3
-"""Normal force from which a contact counts as loaded, body weights."""
+"""Minimum normal force of a loaded contact, body weights."""
 RESTART_BUDGET = 3
-"""Factor by which restarts raise the limit of QPs, because sliding feet have many states of similar cost."""
+"""Factor by which restarts raise the limit of QPs, because sliding feet have many states with similar objectives."""
 
 
 class StateSearch(Enum):
@@ -50,9 +50,9 @@ class StateSearch(Enum):
     QPCC = "qpcc"
     """Start with all contacts static; change one contact at a time by its multipliers (Tan, Turk and Liu 2012)."""
     QPCC_OUR_MOVES = "qpcc-our-moves"
-    """``qpcc`` with the moves of ``relaxed``, to measure the moves alone."""
+    """``qpcc`` with the moves of ``relaxed``, to measure the effect of the moves alone."""
     RELAXED = "relaxed"
-    """Start from the contact response to the relaxed optimum's activations; change several contacts at a time."""
+    """Start from the contact response to the activations of the relaxed optimum; change several contacts at a time."""
     EXACT = "exact"
     """Global optimum by branch and bound, for small problems."""
 
@@ -62,11 +62,11 @@ class SearchResult:
     """Result of a search over contact states."""
 
     y: np.ndarray | None
-    """(variables,) solution, which satisfies Eq. (9) to the QP solver's accuracy; None if no QP had a solution."""
+    """(variables,) solution that satisfies Eq. (9) to the QP solver's accuracy; None if no QP had a solution."""
     relaxed: bool
-    """True if no states were feasible: ``y`` then only satisfies 0 <= x and 0 <= w."""
+    """True if no tried states were feasible; ``y`` then only satisfies 0 <= x and 0 <= w."""
     states: np.ndarray
-    """(n,) contact states."""
+    """(n,) contact states of the solution."""
     objective: float
     """Objective, including the QP's constant; infinite if ``y`` is None."""
     qp_count: int
@@ -82,13 +82,13 @@ class _Search:
     program: PyramidProgram
     qp: QuadraticProgram
     limit: int
-    """Maximum number of QPs; ``RESTART_BUDGET`` times as many are allowed while ``best`` is far from the bound."""
+    """Maximum number of QPs; it is multiplied by ``RESTART_BUDGET`` while ``best`` is far from the bound."""
     zero: float = 1e-4
-    """Values of pairs and multipliers up to this count as zero."""
+    """Maximum value of pairs and multipliers that are treated as zero."""
     count: int = 0
     infeasible: int = 0
     relaxed: QpSolution | None = None
-    """Optimum without complementarity, a lower bound on the objective of all states."""
+    """Optimum without complementarity. Its objective is a lower bound on the objectives of all states."""
     best: QpSolution | None = None
     states: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     """(n,) states of ``best``."""
@@ -133,8 +133,8 @@ class _Search:
         return True
 
     def is_within_gap(self, factor: float, share: float = 0.0) -> bool:
-        """Return True if the best objective exceeds its lower bound by at most ``factor``, or by at most a ``share`` of
-        the cost of doing nothing."""
+        """Return True if the best objective is at most ``factor`` times its lower bound, or exceeds it by at most
+        ``share`` times the cost of doing nothing."""
         if self.best is None or self.relaxed is None:
             return False
         constant = self.program.constant
@@ -253,9 +253,9 @@ def contact_response(program: PyramidProgram, activations: np.ndarray) -> np.nda
 
 
 def _start_relaxed(search: _Search, predicted: np.ndarray, activations: np.ndarray) -> None:
-    """Start from the contact response to the activations of the relaxed optimum, where only 0 <= x and 0 <= w hold. Its
-    objective bounds that of all states from below; its activations are usually near the optimum, its forces
-    are not."""
+    """Start from the contact response to the activations of the relaxed optimum, which only satisfies 0 <= x and 0 <=
+    w. Its objective bounds the objective of all states from below. Its activations are usually near the optimum; its
+    forces are not."""
     program, layout = search.program, search.program.layout
     lower, upper = program.bounds(np.full(layout.contacts, STATIC))
     upper[layout.activations :] = np.inf
@@ -269,8 +269,8 @@ def _start_relaxed(search: _Search, predicted: np.ndarray, activations: np.ndarr
 
 
 def _other_starts(search: _Search, predicted: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield states (n,) for restarts: contacts static where the relaxed optimum has a normal force, then static where
-    the prediction has one, and last the predicted states."""
+    """Yield states (n,) for restarts: first, contacts are static where the relaxed optimum has a normal force; second,
+    where the prediction has one; last, the predicted states."""
     if search.relaxed is not None:
         layout = search.program.layout
         loaded = search.relaxed.x[layout.normal] > LOADED_FORCE
@@ -280,14 +280,14 @@ def _other_starts(search: _Search, predicted: np.ndarray) -> Iterator[np.ndarray
 
 
 def _move(search: _Search, *, together: bool) -> None:
-    """Change states by the proposed moves while that lowers the objective: first the best moves of all contacts at once
-    if ``together``, then one by one."""
+    """Change states by the proposed moves while this lowers the objective. With ``together``, first try the best moves
+    of all contacts at once, then one move at a time."""
     improved = search.best is not None
     while improved and not search.is_within_gap(STOP_GAP):
         pivots = search.pivots()
         trials = [_moved(search.states, [pivot]) for pivot in pivots]
         if together:
-            # Reversed, so that the best move of each contact is applied last.
+            # Reverse the order, so that the best move of each contact is applied last.
             trials.insert(0, _moved(search.states, pivots[::-1]))
         improved = any(search.try_states(trial) for trial in trials)
 

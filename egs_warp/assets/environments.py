@@ -21,7 +21,8 @@ Paint = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Linear albedo (n, 3) and gloss (n,) at points (n, 3)."""
 
 SQUARE = 0.7
-"""Side of a square of the chess board, as a multiple of the pawn's height; the pawn's base is five sixths as wide."""
+"""Side of a square of the chess board, as a multiple of the pawn's height; the pawn's base has five sixths of this
+width."""
 
 
 def chess_board(*, squares: int = 8, seed: int = 1, device: str | None = None) -> GaussianCloud:
@@ -34,7 +35,7 @@ def chess_board(*, squares: int = 8, seed: int = 1, device: str | None = None) -
     frame = 0.35
     low = np.array([-0.5 * SQUARE - frame, -0.5 * squares * SQUARE - frame])
     high = np.array([(squares - 0.5) * SQUARE + frame, 0.5 * squares * SQUARE + frame])
-    # The pawn's row is in the middle of the board. Without jitter no sample lies on a line between squares.
+    # The pawn's row is in the middle of the board. Without jitter, no sample lies on a line between squares.
     shift = np.array([0.0, 0.5 * SQUARE])
     top = _level(low + shift, high + shift, spacing, random, jitter=0.0)
 
@@ -115,7 +116,7 @@ def cloth_table(*, radius: float = 1.7, seed: int = 1, device: str | None = None
     skirt = SurfaceSamples(drape(angle, drop), normal / np.linalg.norm(normal, axis=1, keepdims=True), spacing)
 
     def paint(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # Coordinates in the cloth: on the skirt the pattern continues by the length that hangs down.
+        # Coordinates in the cloth: on the skirt, the pattern continues with the length that hangs down.
         flat = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
         stretch = np.minimum((np.minimum(flat, radius) - points[:, 2]) / flat, 3.0)
         u, v = points[:, 0] * stretch / 0.28, points[:, 1] * stretch / 0.28

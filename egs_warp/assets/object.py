@@ -18,7 +18,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 
 KEY_LIGHT = np.array([-0.55, -0.62, 0.95])
-"""(3,) Direction to the key light of every built-in scene, not normalized."""
+"""(3,) Direction to the key light of every built-in scene, not normalised."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def shade_gaussians(
     """
     up = np.array([0.0, 0.0, 1.0])
     light = bake_light(samples, vertices, faces, up=up, light_direction=KEY_LIGHT, reach=0.35, device=device)
-    # The hidden underside is moved a little inside, so that only the tails of its Gaussians cross the plane.
+    # Move the hidden underside a little inside, so that only the tails of its Gaussians cross the plane.
     lift = (
         0.22 * samples.spacing * np.clip(-samples.normals[:, 2:], 0.0, 1.0) * (samples.points[:, 2:] < samples.spacing)
     )

@@ -100,13 +100,15 @@ def _turned_mesh(rings: int = 160, around: int = 96) -> tuple[np.ndarray, np.nda
 
 
 def _wood(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return linear albedo (n, 3) and gloss (n,) of wood whose growth rings have a vertical axis beside the pawn's."""
+    """Return linear albedo (n, 3) and gloss (n,) of wood. The common axis of its growth rings is vertical and beside
+    the pawn's."""
     x, y, z = points.T
     wobble = 0.012 * np.sin(5.3 * z + 1.0) + 0.006 * np.sin(17.0 * z + 9.0 * x)
     ring_radius = np.hypot(x - 0.42 + wobble, y + 0.23 - 0.6 * wobble)
     rings = ring_radius / 0.034
     phase = rings - np.floor(rings)
-    # Late wood darkens slowly and ends abruptly, as growth rings do; the edge is softened to what Gaussians resolve.
+    # Late wood darkens slowly and ends abruptly at each growth ring; the edge is softened to the resolution of the
+    # Gaussians.
     late = phase**3 * (1.0 - np.clip((phase - 0.88) / 0.12, 0.0, 1.0))
     fibre = 0.5 + 0.5 * np.sin(230.0 * np.arctan2(y + 0.23, x - 0.42) + 6.0 * np.sin(9.0 * z))
     tone = 1.0 - 0.85 * late - 0.10 * fibre - 0.05 * np.sin(3.1 * z + 7.0 * x)

@@ -36,7 +36,7 @@ def _straight(points: np.ndarray) -> np.ndarray:
 def _distance(points: np.ndarray) -> np.ndarray:
     straight = _straight(points)
     y = straight[:, 1]
-    # From 0 at the neck to 1 at the tail's tip.
+    # 0 at the neck, 1 at the tail's tip.
     along = np.clip((y + 0.9) / (_TAIL + 0.9), 0.0, 1.0)
     radius = 0.115 * (1.0 - along**3) + 0.055 * along**3 - 0.02 * np.exp(-(((y + 0.8) / 0.12) ** 2))
     past = y - np.clip(y, -0.9, _TAIL - 0.06)

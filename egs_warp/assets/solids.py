@@ -15,7 +15,7 @@ Distance = Callable[[np.ndarray], np.ndarray]
 
 
 def rounded_box(points: np.ndarray, centre: np.ndarray, half: np.ndarray, radius: float) -> np.ndarray:
-    """Return the distance to a box with half sides ``half`` (3,) and edges rounded by ``radius``."""
+    """Return the distance (m,) to a box with half sides ``half`` (3,) and edges rounded by ``radius``."""
     q = np.abs(points - centre) - (np.asarray(half) - radius)
     outside = np.linalg.norm(np.maximum(q, 0.0), axis=1)
     return outside + np.minimum(q.max(axis=1), 0.0) - radius
@@ -24,14 +24,15 @@ def rounded_box(points: np.ndarray, centre: np.ndarray, half: np.ndarray, radius
 def tapered_rod(
     points: np.ndarray, start: np.ndarray, end: np.ndarray, start_radius: float, end_radius: float
 ) -> np.ndarray:
-    """Return the distance to a rod from ``start`` to ``end`` (3,) with round ends and a linearly changing radius."""
+    """Return the distance (m,) to a rod from ``start`` to ``end`` (3,) with round ends and a linearly changing
+    radius."""
     axis = np.asarray(end, float) - start
     t = np.clip((points - start) @ axis / (axis @ axis), 0.0, 1.0)
     return np.linalg.norm(points - start - t[:, None] * axis, axis=1) - (start_radius + t * (end_radius - start_radius))
 
 
 def ellipsoid(points: np.ndarray, centre: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """Return the distance to an ellipsoid, exact to first order at the surface."""
+    """Return the distance (m,) to an ellipsoid, exact to first order at the surface."""
     q = points - centre
     k0, k1 = np.linalg.norm(q / radii, axis=1), np.linalg.norm(q / np.square(radii), axis=1)
     return k0 * (k0 - 1.0) / np.maximum(k1, 1e-12)
@@ -55,11 +56,12 @@ def surface_mesh(distance: Distance, low: np.ndarray, high: np.ndarray, step: fl
 def even_samples(
     distance: Distance, vertices: np.ndarray, faces: np.ndarray, count: int, random: np.random.Generator
 ) -> SurfaceSamples:
-    """Sample ``count`` points evenly: draw them by area, then push them apart along the surface and project them."""
+    """Sample ``count`` points evenly: draw points by area, then repel neighbours along the surface and project the
+    points onto it."""
     corners = vertices[faces]
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     spacing = float(np.sqrt(areas.sum() / count))
-    # Stratified along the cumulative area, so that no face is crowded at the start.
+    # Stratify along the cumulative area, so that the initial points are not crowded on any face.
     drawn = np.searchsorted(np.cumsum(areas), areas.sum() * (np.arange(count) + random.uniform(size=count)) / count)
     u = random.uniform(size=(count, 2))
     u = np.where(u.sum(axis=1, keepdims=True) > 1.0, 1.0 - u, u)

@@ -32,7 +32,7 @@ class SurfaceSamples:
     """Points spread evenly over a surface."""
 
     points: np.ndarray
-    """(n, 3) float64, scene units."""
+    """(n, 3) float64, positions, scene units."""
     normals: np.ndarray
     """(n, 3) float64, unit vectors, outward."""
     spacing: float
@@ -41,7 +41,7 @@ class SurfaceSamples:
 
 @dataclass(frozen=True)
 class BakedLight:
-    """Light that reaches each sample, 0 to 1, before it is multiplied by the albedo."""
+    """Light that reaches each sample, 0 to 1, to be multiplied by the albedo."""
 
     sky: np.ndarray
     """(n,) Cosine-weighted fraction of the hemisphere in which the sky is visible."""
@@ -71,7 +71,7 @@ def bake_light(
         occluder_faces: (f, 3) triangles.
         up: (3,) unit vector.
         light_direction: (3,) to the key light.
-        reach: Length of the ambient rays, and the distance over which the object shades the ground, scene units.
+        reach: Length of the ambient rays, and distance over which the object shades the ground, scene units.
         ground_height: Scene units along ``up``; None means no ground.
         light_softness: Tangent of the half angle of the key light, which is a disc.
         device: Warp device; None is the current one.
@@ -103,7 +103,7 @@ def bake_light(
         device=device,
     )
     sky, ground, key_visible = (output.numpy().astype(np.float64) for output in outputs)
-    # This approximates the light that bounces inside creases, which single rays miss.
+    # Add a constant part for the light that bounces inside creases, which single rays miss.
     sky = 0.12 + 0.88 * sky
     return BakedLight(sky, ground, key_visible * np.clip(samples.normals @ light, 0.0, None))
 
@@ -122,7 +122,7 @@ def lit_colour(
         + light.sky[:, None] * np.array(sky_colour)
         + light.ground[:, None] * np.array(ground_colour)
     )
-    # The soft shoulder prevents lit parts from clipping to white.
+    # The smooth saturation prevents lit parts from clipping to white.
     return np.clip(1.0 - np.exp(-1.25 * linear), 0.0, 1.0) ** (1.0 / 2.2)
 
 
@@ -135,7 +135,8 @@ def sh_from_colour(
 ) -> np.ndarray:
     """Return SH coefficients of degree 3 (n, 16, 3): ``colour`` (n, 3) plus a smooth highlight.
 
-    The lobe is zonal, with band weights 1, 0.9, 0.6, 0.25 of a delta: its negative ring stays below 6 % of the peak.
+    The lobe is zonal, with the band weights 1, 0.9, 0.6 and 0.25 of a delta function; its negative ring stays below 6 %
+    of the peak.
     SH are evaluated in the direction from the camera to the Gaussian, hence the minus sign.
 
     Args:

@@ -1,5 +1,5 @@
-"""Blender add-on that plays runs and bundles. In: the folder of a run, or a bundle. Out: objects in Blender, and files
-of edited muscles and cages. It has no section in the paper; see docs/guide/blender.md.
+"""Blender add-on that plays runs and bundles. Input: the folder of a run, or a bundle. Output: objects in Blender, and
+files of edited muscles and cages. No section of the paper describes it; see docs/guide/blender.md.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ class _Export(ExportHelper):
     """Operator that writes a part of the active creature to a file."""
 
     noun: str
-    """Noun of the message, which follows a number."""
+    """Noun in the message after the number that ``write`` returns."""
 
     @staticmethod
     def write(path: Path, root: bpy.types.Object, performance: Performance) -> int:
-        """Write the file; return what the message counts."""
+        """Write the file; return the number of written elements, for the message."""
         raise NotImplementedError
 
     @classmethod

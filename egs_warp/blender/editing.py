@@ -1,4 +1,4 @@
-"""Cage and muscles at rest, to edit, and the files of both that ``egs-warp animate`` reads."""
+"""Editable cage and muscles at rest, and the files of both that ``egs-warp animate`` reads."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from .overlays import add_cage, poly_curve
 from .performance import Performance
 
 STRENGTH = "strength"
-"""Custom property of a curve: largest force, body weights."""
+"""Custom property of a curve: maximum force, body weights."""
 _DEFAULT_STRENGTH = 2.0
 _NO_REST_OBJECTS = "a bundle has neither muscles nor a cage to edit; import the folder of the run"
 _SUFFIX = "to edit"
-"""End of the name of the collection with the objects to edit."""
+"""Suffix of the name of the collection of editable objects."""
 
 
 def add_rest_objects(performance: Performance, root: bpy.types.Object, collection: bpy.types.Collection) -> None:
@@ -114,7 +114,7 @@ def muscles_as_json(root: bpy.types.Object, performance: Performance) -> str:
 
 
 def _rest_objects(root: bpy.types.Object, kind: str) -> list[bpy.types.Object]:
-    """Return the objects of a type in the collection to edit of a creature."""
+    """Return the objects of type ``kind`` in the collection of a creature's editable objects."""
     return [
         member
         for home in root.users_collection
@@ -126,8 +126,8 @@ def _rest_objects(root: bpy.types.Object, kind: str) -> list[bpy.types.Object]:
 
 
 def _in_root(points: np.ndarray, member: bpy.types.Object, root: bpy.types.Object) -> np.ndarray:
-    """Transform points (n, 3) from the space of ``member`` to that of ``root``; Blender does not update
-    ``matrix_world`` of hidden objects."""
+    """Transform points (n, 3) from the space of ``member`` to the space of ``root``. ``matrix_world`` is not used,
+    because Blender does not update it for hidden objects."""
     if member.parent == root:
         matrix = np.array(member.matrix_parent_inverse @ member.matrix_basis)
     else:
@@ -136,7 +136,7 @@ def _in_root(points: np.ndarray, member: bpy.types.Object, root: bpy.types.Objec
 
 
 def _points(spline: bpy.types.Spline) -> np.ndarray:
-    """Return the control points (n, 3) in the space of the curve."""
+    """Return the control points (n, 3) of ``spline`` in the space of the curve."""
     if spline.type == "BEZIER":
         return np.array([point.co for point in spline.bezier_points], float).reshape(-1, 3)
     return np.array([point.co[:3] for point in spline.points], float).reshape(-1, 3)

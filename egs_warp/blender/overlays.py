@@ -1,7 +1,6 @@
 """Cage, muscles, contact forces, centre of mass and camera as objects.
 
-All but the camera follow the performance, are drawn in front of the splats, and are hidden in renders until the user
-shows them.
+All except the camera follow the performance, are drawn in front of the splats, and are hidden in renders by default.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ _GROUP = "egs_warp tubes"
 
 
 def add_cage(performance: Performance, name: str) -> bpy.types.Object:
-    """Return a new mesh of the surface of the cage; its vertices are all nodes, in their order."""
+    """Return a new mesh of the cage's surface. Its vertices are all nodes of the cage, in the same order."""
     arrays = performance.bundle.arrays
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(arrays["rest_nodes"].tolist(), [], boundary_faces(arrays["cage_tets"]).tolist())
@@ -128,7 +127,8 @@ def poly_curve(name: str, points: np.ndarray, *, cyclic: bool = False) -> bpy.ty
 
 
 def boundary_faces(tets: np.ndarray) -> np.ndarray:
-    """Return the faces (B, 3) of ``tets`` (T, 4) that only one tetrahedron has, with their normals outward."""
+    """Return the faces (B, 3) that belong to exactly one of the tetrahedra ``tets`` (T, 4), with their normals
+    outward."""
     faces = tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[np.sort(first[count == 1])]
@@ -140,14 +140,14 @@ ADD: dict[str, Callable[[Performance, str], bpy.types.Object]] = {
     "contact forces": add_forces,
     "centre of mass": add_centre_of_mass,
 }
-"""Makes the object of each kind."""
+"""Functions that create the object of each kind."""
 MOVE: dict[str, Callable[[bpy.types.Object, Performance, float], None]] = {
     "cage": deform_cage,
     "muscles": deform_muscles,
     "contact forces": deform_forces,
     "centre of mass": move_centre_of_mass,
 }
-"""Moves the object of each kind to a frame."""
+"""Functions that move the object of each kind to a frame."""
 
 
 def _set_positions(mesh: bpy.types.Mesh, positions: np.ndarray) -> None:

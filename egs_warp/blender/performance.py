@@ -15,7 +15,7 @@ TRAJECTORY, CREATURE = "trajectory.npz", "creature.npz"
 FRAME_RATE = 60.0
 """Frames per second of a run, as in its film."""
 BAND_0 = 0.28209479177387814
-"""Spherical harmonic of band 0."""
+"""Value of the spherical harmonic of band 0."""
 _READ_ERRORS = (
     *(OSError, ValueError, KeyError, IndexError, TypeError, AssertionError, EOFError, MemoryError),
     *(zipfile.BadZipFile, zlib.error, np.linalg.LinAlgError),
@@ -27,7 +27,7 @@ class ReadError(Exception):
 
 
 class _RunSplats(Bundle):
-    """Splats of a run, with the arrays of a bundle but without a track."""
+    """Splats of a run, with the arrays of a bundle but without node positions over time."""
 
     def __init__(self, arrays: dict[str, np.ndarray], max_stretch: float) -> None:
         self.arrays, self.body = arrays, {"max_stretch": max_stretch}
@@ -41,9 +41,9 @@ class Muscles:
     ends: np.ndarray
     """(P, N) weights that give the end points from the positions of the nodes."""
     segments: np.ndarray
-    """(M, 2) int32, end points of each segment."""
+    """(M, 2) int32, indices of the end points of each segment."""
     activations: np.ndarray
-    """(S, M) from -1 to 1, relative to the bounds of the segments."""
+    """(S, M), -1 to 1, activation of each segment divided by its bound."""
     fibre_from_segment: np.ndarray
     """(M,) int32, fibre of each segment."""
     names: tuple[str, ...]
@@ -55,9 +55,9 @@ class Muscles:
     capture_axes: np.ndarray
     """(3, 3) rows are the axes of the body's frame in the capture."""
     capture_origin: np.ndarray
-    """(3,) origin of the body's frame in the capture, in its units."""
+    """(3,) origin of the body's frame in the capture, units of the capture."""
     metres_per_unit: float
-    """Metres for one unit of the capture."""
+    """Number of metres in one unit of the capture."""
 
     def in_capture(self, points: np.ndarray) -> np.ndarray:
         """Transform ``points`` (n, 3), m, to the frame and units of the capture."""
@@ -66,44 +66,45 @@ class Muscles:
 
 @dataclass(frozen=True)
 class Contacts:
-    """Contacts of all solver steps of a run: C contacts."""
+    """Contacts in all solver steps of a run; C is their number."""
 
     step: np.ndarray
-    """(C,) int32, the step; step i leads from state i to state i + 1."""
+    """(C,) int32, solver step of each contact; step i leads from state i to state i + 1."""
     nodes: np.ndarray
-    """(C, 4) int32."""
+    """(C, 4) int32, cage nodes whose combination is the contact point."""
     weights: np.ndarray
-    """(C, 4) weights of the nodes, whose sum is the contact point."""
+    """(C, 4) weights of these nodes."""
     force: np.ndarray
     """(C, 3) force on the body, body weights."""
 
 
 @dataclass(frozen=True)
 class FilmCamera:
-    """Camera of the film of a run, pixels and metres."""
+    """Camera of the film of a run; lengths in pixels and metres."""
 
     rotation: np.ndarray
-    """(3, 3) from the frame of the body to x right, y down, z forward."""
+    """(3, 3) rotation from the frame of the body to the camera's axes: x right, y down, z forward."""
     centre: np.ndarray
-    """(3,)."""
+    """(3,) position, m, frame of the body."""
     focal_length: float
     principal_point: tuple[float, float]
     size: tuple[int, int]
-    """Width and height."""
+    """Width and height, pixels."""
 
 
 @dataclass(frozen=True)
 class Performance:
-    """Splats, cage and motion of one creature; metres, z up, the ground under the body at rest is z = 0."""
+    """Splats, cage and motion of one creature, in metres. The z axis points up, and the ground under the body at rest
+    is z = 0."""
 
     name: str
     """Name of the file, or of the folder of the run."""
     bundle: Bundle
     """Splats at rest, and how the cage deforms them."""
     opacity_logits: np.ndarray
-    """(n,)."""
+    """(n,) logits of the opacities of the splats."""
     band_0: np.ndarray
-    """(n, 3) spherical harmonics of band 0."""
+    """(n, 3) SH coefficients of band 0."""
     track: np.ndarray
     """(F, N, 3) positions of the nodes in each frame, m."""
     fps: float
@@ -113,7 +114,7 @@ class Performance:
     node_mass: np.ndarray
     """(N,) kg; empty in a bundle."""
     height: float
-    """Body height, m."""
+    """Height of the body, m."""
     muscles: Muscles | None
     """None in a bundle."""
     contacts: Contacts | None
@@ -127,7 +128,7 @@ class Performance:
         return len(self.track)
 
     def clamped(self, index: float) -> float:
-        """Return the frame, with a fraction, that is shown at ``index``: the first or last one outside the motion."""
+        """Return the fractional frame index that is shown at ``index``: it is limited to the first and last frame."""
         return min(max(index, 0.0), self.frame_count - 1.0)
 
     def nodes(self, index: float) -> np.ndarray:
@@ -136,8 +137,9 @@ class Performance:
         return before + (index % 1) * (after - before)
 
     def splats(self, index: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return means (n, 3), covariances and rotations (n, 3, 3) of the splats."""
-        # The reader deforms the splats to a frame of its own track.
+        """Return means (n, 3), covariances (n, 3, 3) and rotations (n, 3, 3) of the splats at the fractional frame
+        ``index``."""
+        # Set the only frame of the bundle's track: the reader deforms splats to frames of its own track.
         self.bundle.nodes = self.nodes(index)[None]
         return self.bundle.frame(0)
 
@@ -148,8 +150,8 @@ class Performance:
         return muscles.activations[step - 1] if step > 0 else np.zeros(len(muscles.segments))
 
     def forces(self, index: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return contact points, m, and forces, body weights, both (C, 3), of the step that leads to the nearest
-        frame."""
+        """Return contact points, m, and forces on the body, body weights, both (C, 3), in the step that leads to the
+        nearest frame."""
         contacts = self.contacts
         assert contacts is not None
         chosen = np.flatnonzero(contacts.step == int(self.steps[round(index)]) - 1)
@@ -162,10 +164,11 @@ class Performance:
 
 
 def read_performance(path: Path) -> Performance:
-    """Read the first body of a bundle, or the run that ``path`` is in: its folder or one of its two files of arrays.
+    """Read the first body of a bundle, or the run to which ``path`` belongs: its folder or one of its two files of
+    arrays.
 
     Raises:
-        ReadError: the files are missing or are not those of a run or a bundle.
+        ReadError: the files are missing or do not belong to a run or a bundle.
     """
     if path.is_dir() or path.name in (TRAJECTORY, CREATURE):
         return _read_run(path if path.is_dir() else path.parent)
@@ -203,7 +206,7 @@ def _read_run(folder: Path) -> Performance:
         weight = float(run["node_mass"].sum() * np.linalg.norm(run["gravity"]))
         splats = creature | {"rotations": _rotation_vectors(creature["rotations"])}
         splats |= {"rest_nodes": run["rest_positions"], "cage_tets": run["tets"]}
-        # The arrays of a bundle hold the differences from the tetrahedra of the means.
+        # A bundle stores the tetrahedra of the arms relative to the tetrahedra of the means.
         splats["arm_tets"] = creature["arm_tets"] - creature["tets"][creature["carriers"] == 1, None]
         return Performance(
             name=folder.resolve().name,
@@ -226,7 +229,7 @@ def _read_run(folder: Path) -> Performance:
 
 
 def _rotation_vectors(quaternions: np.ndarray) -> np.ndarray:
-    """Return axis times angle (n, 3), rad, of unit quaternions (n, 4), w, x, y, z."""
+    """Return the rotation vectors (n, 3), axis times angle in rad, of unit quaternions (n, 4), w, x, y, z."""
     w, xyz = np.split(quaternions.astype(float), [1], axis=1)
     sines = np.linalg.norm(xyz, axis=1, keepdims=True)
     return xyz * (2.0 * np.arctan2(sines, w) / np.maximum(sines, 1e-300))

@@ -14,13 +14,13 @@ from .splats import add_splats, deform_splats
 
 _SPLATS = "splats"
 _TRANSPARENT_BOUNCES = 256
-"""Number of splats that a ray of Cycles may pass."""
+"""Maximum number of splats that a ray of Cycles passes through."""
 _performances: dict[tuple[str, float], Performance] = {}
-"""Performances that are shown, by file and time of its last change."""
+"""Loaded performances, by file and modification time."""
 
 
 class Playback(bpy.types.PropertyGroup):
-    """Properties of the objects of a creature: ``source`` is set on its empty, ``part`` on what moves."""
+    """Properties of a creature's objects: ``source`` is set on its empty, ``part`` on each moving object."""
 
     source: bpy.props.StringProperty(  # type: ignore[valid-type]
         name="Source", subtype="FILE_PATH", description="Bundle, or folder of the run"
@@ -35,12 +35,12 @@ class Playback(bpy.types.PropertyGroup):
 
 
 def add_creature(context: bpy.types.Context, path: Path, *, set_up_scene: bool) -> bpy.types.Object:
-    """Add a creature to the collection of ``context``; return the empty that carries all of its objects.
+    """Add a creature to the collection of ``context``; return the empty that is the parent of all its objects.
 
     Args:
         context: The context of Blender.
         path: As for ``read_performance``.
-        set_up_scene: Set the frame rate and range, and what the splats need for their picture.
+        set_up_scene: Set frame rate, frame range and the render settings that the splats need.
 
     Raises:
         ReadError: the files cannot be read.
@@ -80,7 +80,7 @@ def add_creature(context: bpy.types.Context, path: Path, *, set_up_scene: bool) 
 
 @persistent
 def show(scene: bpy.types.Scene, _: object = None) -> None:
-    """Move all creatures to the frame of ``scene``; one whose source is missing stays as it is."""
+    """Move all creatures to the frame of ``scene``; a creature whose source is missing does not move."""
     for root in scene.objects:
         if not root.egs_warp.source:
             continue
@@ -98,7 +98,7 @@ def show(scene: bpy.types.Scene, _: object = None) -> None:
 
 
 def performance_of(root: bpy.types.Object) -> Performance:
-    """Return the performance of a creature, which is read once.
+    """Return the performance of a creature; its files are read only once.
 
     Raises:
         ReadError: its source cannot be read.
@@ -111,7 +111,7 @@ def performance_of(root: bpy.types.Object) -> Performance:
 
 
 def creature_of(part: bpy.types.Object | None) -> bpy.types.Object | None:
-    """Return the empty of the creature that ``part`` belongs to; None if it belongs to none."""
+    """Return the empty of the creature to which ``part`` belongs; None if there is none."""
     while part is not None and not part.egs_warp.source:
         part = part.parent
     return part
@@ -134,12 +134,12 @@ def _key(path: Path) -> tuple[str, float]:
 
 def _set_up(scene: bpy.types.Scene, performance: Performance) -> None:
     scene.render.fps, scene.render.fps_base = round(performance.fps), round(performance.fps) / performance.fps
-    # Frames count from 0, as those of the run.
+    # Frames are numbered from 0, like the frames of a run.
     scene.frame_start, scene.frame_end = 0, performance.frame_count - 1
     scene.frame_set(0)
     # The handler changes meshes, which the user interface must not draw at the same time.
     scene.render.use_lock_interface = True
-    # The colours of the splats are those of the picture.
+    # Show the colours of the splats unchanged.
     scene.view_settings.view_transform = "Standard"
     if hasattr(scene, "cycles"):
         scene.cycles.transparent_max_bounces = _TRANSPARENT_BOUNCES

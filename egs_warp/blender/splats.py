@@ -1,7 +1,7 @@
 """The splats as points of a mesh, with the attributes of a 3DGS ``.ply``, shown as soft ellipsoids.
 
-Other add-ons read these attributes from the evaluated mesh, so the modifier adds the ellipsoids to the points instead
-of replacing them.
+Other add-ons read these attributes from the evaluated mesh. Therefore the modifier adds the ellipsoids to the points
+instead of replacing the points.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from .performance import BAND_0, Performance
 NAME = "egs_warp splats"
 """Name of the node group and of the material, which all creatures share."""
 _RADIUS = 3.0
-"""Radius of an ellipsoid, standard deviations; the opacity is 1 % of that of the centre there."""
+"""Radius of an ellipsoid, standard deviations; there, the opacity is 1 % of the opacity at the centre."""
 _MOVING = ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 
 
@@ -37,7 +37,7 @@ def add_splats(performance: Performance, name: str) -> bpy.types.Object:
 
 
 def deform_splats(splats: bpy.types.Object, performance: Performance, index: float) -> None:
-    """Move the splats to frame ``index`` of the performance, which may have a fraction."""
+    """Move the splats to the frame ``index`` of the performance, which may be fractional."""
     mesh = splats.data
     means, covariances, _ = performance.splats(index)
     variances, axes = np.linalg.eigh(covariances)
@@ -116,10 +116,10 @@ def _attribute(tree: bpy.types.NodeTree, name: str) -> bpy.types.NodeSocket:
 
 
 def _material() -> bpy.types.Material:
-    """Return a material whose opacity is the largest value of the Gaussian along the line of sight.
+    """Return a material whose opacity is the maximum of the Gaussian along the line of sight.
 
     In the space of the unit Gaussian, a line through p with unit direction d passes the centre at the squared distance
-    p.p - (p.d)^2. The back of an ellipsoid is invisible, so that each counts once.
+    p.p - (p.d)^2. The back faces of an ellipsoid are invisible, so that a ray meets each ellipsoid once.
     """
     material = bpy.data.materials.new(NAME)
     material.use_nodes = True

@@ -36,9 +36,9 @@ class DeformationMethod(Enum):
     LOCAL_TETRAHEDRON = "local tetrahedron"
     """Tetrahedron around each Gaussian, embedded in the cage (VR-GS, Jiang et al. 2024)."""
     BIDIRECTIONAL_NO_SPLIT = "bidirectional, no split"
-    """T+ and T- (Eq. 14, 15)."""
+    """Mean of the gradients of T+ and T- (Eq. 14, 15)."""
     BIDIRECTIONAL = "bidirectional"
-    """T+ and T-, with splitting of bent Gaussians (Eq. 14-17)."""
+    """Mean of the gradients of T+ and T-, with splitting of bent Gaussians (Eq. 14-17)."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class BoundSurface:
     """Triangles at rest to which ``DeformationMethod.SURFACE`` binds Gaussians; the cage deforms their vertices."""
 
     vertices: np.ndarray
-    """(V, 3) float64, m."""
+    """(V, 3) float64, vertices at rest, m."""
     faces: np.ndarray
     """(F, 3) int32, each triangle with positive area."""
 

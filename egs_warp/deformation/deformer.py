@@ -21,11 +21,12 @@ from egs_warp.launching import empty, launch_rows, zeros
 from egs_warp.precision import Vec3
 
 MAX_STRETCH = 1.5
-"""Largest stretch of an arm relative to the material at its two ends; more would show as a spike."""
+"""Maximum stretch of an arm relative to the stretch of the material at its two ends; a larger one would appear as a
+spike."""
 
 MIN_BRIDGE = 1e-3
-"""Shortest arm, relative to the cage's diagonal, that is deformed by a difference of positions; below that float32 is
-too coarse."""
+"""Minimum length of an arm that is deformed by a difference of positions, relative to the cage's diagonal. For shorter
+arms, the rounding errors of float32 are too large."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class CageMaps:
             self._maps.frames = empty(2 * tet_count, wp.vec4, cage.device)
 
     def update(self, positions: wp.array | np.ndarray) -> Any:
-        """Return the kernels' ``CageMaps`` for node ``positions``, which are given as for ``Deformer.deform``."""
+        """Return the kernels' ``CageMaps`` for node ``positions``, in the format of ``Deformer.deform``."""
         cage, device = self._cage, self._cage.device
         launch_rows(
             cage_maps.update_maps_kernel,

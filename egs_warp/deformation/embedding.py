@@ -18,8 +18,8 @@ UNSCENTED_GAMMA = 3.0**0.5
 """Arm length in standard deviations for which the seven points integrate cubics over the Gaussian exactly."""
 
 MIN_ARM_LENGTH = 1e-6
-"""Shortest arm, relative to the cage's diagonal. With a scale of e^-16, differences of positions would be mostly
-rounding error even in float64."""
+"""Minimum length of an arm, relative to the cage's diagonal. For a scale of e^-16, differences of positions would be
+mostly rounding error even in float64."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,12 @@ class PointEmbedding:
     """Points as fixed combinations of the corners of one tetrahedron each (Eq. 2)."""
 
     tets: wp.array
-    """(P,) int32, index of the tetrahedron that contains the point, or of the nearest one for a point outside all."""
+    """(P,) int32, index of the tetrahedron that contains the point, or of the nearest one if no tetrahedron contains
+    it."""
     nodes: wp.array
     """(P,) vec4i, node indices of its corners."""
     weights: wp.array
-    """(P,) vec4d, barycentric weights of sum 1; negative ones extrapolate."""
+    """(P,) vec4d, barycentric weights with sum 1; negative weights extrapolate."""
     inside: wp.array
     """(P,) bool, True if a tetrahedron contains the point."""
 
@@ -73,7 +74,7 @@ class CageLocator:
         with wp.ScopedDevice(self.device):
             self._nodes = wp.array(local, dtype=Vec3)
             self.tets = wp.array(mesh.tets, dtype=wp.vec4i)
-            """(T,) vec4i node indices."""
+            """(T,) vec4i, node indices of each tetrahedron."""
             self.inverse_edges = wp.array(np.linalg.inv(edges), dtype=Mat33)
             """(T,) mat33d, D_m^-1 of each rest tetrahedron, 1/m."""
             self._box_lowers = wp.array((corners.min(axis=1) - margin).astype(np.float32), dtype=wp.vec3)
@@ -94,7 +95,7 @@ class CageLocator:
         return embedding
 
     def locate_gaussians(self, cloud: GaussianCloud, gamma: float) -> tuple[PointEmbedding, wp.array]:
-        """Embed the seven points of each Gaussian, like ``embed_gaussians``; return the embedding of 7n rows and the
+        """Embed the seven points of each Gaussian, like ``embed_gaussians``. Return the embedding with 7n rows and the
         arm lengths (n, 6), m."""
         embedding = self._empty_embedding(7 * cloud.count)
         arms = empty((cloud.count, 6), wp.float32, self.device)
@@ -165,7 +166,7 @@ def embed_points(mesh: TetMesh, points: np.ndarray, *, device: str | wp.Device |
     """Embed ``points`` (P, 3), m, in the tetrahedra of the rest ``mesh`` (Eq. 2).
 
     A point on a shared face belongs to the tetrahedron of lowest index. A point outside every tetrahedron is
-    extrapolated from the nearest one by true distance; at equal distance, from the one whose smallest weight is
+    extrapolated from the nearest one, by Euclidean distance; at equal distance, from the one whose smallest weight is
     largest.
 
     Raises:
@@ -189,7 +190,7 @@ class GaussianEmbedding:
     arms: wp.array
     """(n, 6) float32, m, arm lengths of the three ends of T+, then of T-; gamma s_j, or less where shortened."""
     cage: CageLocator
-    """Rest cage."""
+    """Locator of the rest cage in which the Gaussians are embedded."""
     gamma: float
     """Arm length in standard deviations, before shortening."""
 
@@ -205,9 +206,9 @@ def embed_gaussians(
     """Embed the mean and the six axis ends m +- ``gamma`` s_j r_j of every Gaussian in the rest cage (Eq. 3).
 
     Where the barycentric weights of an end would leave [-1, 2], its arm is shortened until they do not. Pass a
-    ``CageLocator`` to embed several clouds in one cage. The paper's gamma is 3. At sqrt 3 the seven points are the
-    degree-three cubature of the Gaussian's mass, which follows the kinks of a coarse cage better (measured in
-    benchmarks/table1.py).
+    ``CageLocator`` to embed several clouds in one cage. The paper uses gamma = 3. At sqrt 3 the seven points are the
+    degree-three cubature of the Gaussian's mass, which represents the gradient jumps of a coarse cage better (measured
+    in benchmarks/table1.py).
     """
     cage = mesh if isinstance(mesh, CageLocator) else CageLocator(mesh, device=cloud.device)
     points, arms = cage.locate_gaussians(cloud, gamma)

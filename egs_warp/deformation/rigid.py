@@ -13,7 +13,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 
 
 def to_body_frame(cloud: GaussianCloud, frame: BodyFrame) -> GaussianCloud:
-    """Transform the capture's ``cloud`` to ``frame``, colours included; the order of the Gaussians is kept."""
+    """Transform the capture's ``cloud`` to ``frame``, colours included; the order of the Gaussians does not change."""
     turn = Rotation.from_matrix(frame.axes)
     rotations = cloud.rotations.numpy().astype(np.float64)
     moved = GaussianCloud.from_numpy(

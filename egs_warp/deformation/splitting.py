@@ -16,16 +16,17 @@ from egs_warp.kernels.deformation.splitting import split_kernel
 from egs_warp.launching import empty, launch_rows
 
 MIN_OPACITY = 2.0 / 255.0
-"""Opacity up to which a Gaussian is not split: its error is invisible."""
+"""Maximum opacity of a Gaussian that is not split, because its error is invisible."""
 
 SPLIT_DEGREES = 4.0
-"""Smallest angle, deg, between the two ends of an axis at which it is split, for arms of sqrt 3 standard deviations.
-The paper's 15 degrees for arms of 3 standard deviations correspond to 9 degrees here. On the chair of Table 1 they cost
-0.01 to 0.02 dB, and more if smaller fit errors are split."""
+"""Minimum angle, deg, between the two ends of an axis at which it is split, for arms of sqrt 3 standard deviations. The
+paper's 15 degrees for arms of 3 standard deviations correspond to 9 degrees here. On the chair of Table 1 that
+threshold loses 0.01 to 0.02 dB, and more if smaller fit errors are split."""
 
 MIN_FIT_ERROR = 7e-4
-"""Smallest fit error that is split, relative to the cage's diagonal. A smaller value would follow a motion better still
-(benchmarks/table1.py), but would split enough Gaussians of a fuzzy capture to fall below 45 dB at rest."""
+"""Minimum fit error at which a Gaussian is split, relative to the cage's diagonal. A smaller value would represent
+motions more accurately (benchmarks/table1.py), but the additional splits would lower a fuzzy capture's image at rest to
+below 45 dB."""
 
 
 class SplitRule(Enum):
@@ -58,9 +59,9 @@ class SplitGaussians:
         return len(np.unique(self.parents[self.depths > 0]))
 
 
-# Opacity of one Gaussian, and of the outer and the middle of its three children, for which the images of parent and
-# children differ least (root mean square over viewing directions spread evenly over the sphere). The remaining
-# difference is 1.5 to 1.9 % of the opacity. benchmarks/splitting.py recomputes the table.
+# Opacity of one Gaussian, and of the outer and the middle of its three children, that minimise the difference between
+# the images of parent and children (root mean square over viewing directions spread evenly over the sphere). The
+# remaining difference is 1.5 to 1.9 % of the opacity. benchmarks/splitting.py recomputes the table.
 _OPACITIES = np.array(
     [
         (0.0, 0.0, 0.0),
@@ -119,8 +120,8 @@ def split_bent(
 ) -> SplitGaussians:
     """Replace each Gaussian that ``bend`` marks by its children, once (Eq. 17), in the rest configuration.
 
-    ``MEASURED`` marks an axis whose ends are rotated relative to each other by more than ``threshold_degrees``, if the
-    fit error is larger than ``min_error``. ``PAPER`` marks by theta of Eq. (16) alone.
+    ``MEASURED`` marks an axis whose ends are rotated relative to each other by more than ``threshold_degrees``, if its
+    fit error is larger than ``min_error``. ``PAPER`` marks Gaussians by theta of Eq. (16) alone.
 
     Args:
         cloud: n Gaussians.

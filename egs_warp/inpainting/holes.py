@@ -25,10 +25,10 @@ from egs_warp.segmentation.votes import MaskedView, check_size
 _TEXELS = 256
 """Texels across the window on which a hole is drawn."""
 _CONTACT = 0.05
-"""Fraction of the object's height. The part of the object below it hides the floor from every side."""
+"""Fraction of the object's height. The part of the object below this height hides the floor from every side."""
 _LOW = 0.08
-"""Fraction of the object's size. Under parts of the object that are lower than this, the floor is unseen, or seen so
-badly that it is smeared."""
+"""Fraction of the object's size. Under parts of the object that are lower than this, the floor is unseen, or seen only
+at grazing angles and smeared."""
 _LOW_TEXELS = 200
 """Texels across the window of the hole under an object."""
 _BRIDGED = 0.1
@@ -37,11 +37,11 @@ _BRIDGED = 0.1
 
 @dataclass(frozen=True)
 class Hole:
-    """A region of a plane, drawn on a window of the plane."""
+    """A region of a plane, as a mask on a window of the plane."""
 
     window: PlaneWindow
     mask: np.ndarray
-    """(rows, columns) bool, no texel at the window's edge."""
+    """(rows, columns) bool, False at the window's edge."""
 
     def __post_init__(self) -> None:
         if not self.mask.any():
@@ -73,7 +73,7 @@ class Hole:
 
     @classmethod
     def of_outline(cls, plane: Plane, outline: HoleOutline) -> Hole:
-        """Create the hole in ``plane`` from its ``outline``. Raises ``UserError`` if the outline cannot be drawn."""
+        """Create the hole in ``plane`` from its ``outline``. Raises ``UserError`` if the outline is not valid."""
         rows, columns = outline.texels
         try:
             mask = np.zeros((rows, columns), np.uint8)
@@ -107,8 +107,8 @@ def disc(plane: Plane, centre: np.ndarray, radius: float) -> Hole:
 def footprint(object_cloud: GaussianCloud, plane: Plane) -> Hole:
     """Return the part of the plane that an object standing on it hides from every side.
 
-    This is the object's lowest part, seen from above, and what it encloses. Raises ``UserError`` if the object does not
-    reach down to the plane.
+    It is the outline of the object's lowest part, seen from above, with the regions that this part encloses. Raises
+    ``UserError`` if the object does not reach down to the plane.
     """
     means, opacity = object_cloud.means.numpy(), object_cloud.opacities()
     heights = plane.heights(means)
@@ -130,7 +130,8 @@ def footprint(object_cloud: GaussianCloud, plane: Plane) -> Hole:
     window = _window(plane, middle, float(span))
     above = render_gaussians(object_cloud.subset(low), window.camera())
     covered = np.pad(above.alpha.numpy() > 0.5, _TEXELS // 2)
-    # Separate feet stay separate, but a sole is closed: no view has seen its Gaussians, so they are sparse.
+    # Separate feet stay separate holes, but the hole of a sole is closed: no view has seen its Gaussians, so they are
+    # sparse.
     reach = _BRIDGED * _TEXELS
     wide = distance_to(covered) <= reach
     closed = (depth_inside(wide) > reach) | covered
@@ -139,8 +140,8 @@ def footprint(object_cloud: GaussianCloud, plane: Plane) -> Hole:
 
 
 def hole_under(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> Hole | None:
-    """Return the hole within the outline of the object's low part and of the Gaussians removed from under it; None for
-    an object that hangs above the floor."""
+    """Return the hole under an object: the outline of its low part and of the buried Gaussians. None for an object that
+    hangs above the floor."""
     means = cloud.means.numpy().astype(np.float64)
     low = segmentation.buried_mask | (segmentation.object_mask & (plane.heights(means) < _LOW * segmentation.size))
     if not low.any():
@@ -157,8 +158,8 @@ def hole_under(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -
 
 
 def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
-    """Return the floor that the object hides in every view whose picture contains it. More than half of the views must
-    contain that floor.
+    """Return the part of the floor that the object hides in every view whose picture contains it. A point is part of
+    the hole only if more than half of the views contain it.
 
     Raises ``UserError`` if masks do not fit their cameras, all are empty, or they hide no common floor.
     """

@@ -27,21 +27,22 @@ from egs_warp.inpainting.stains import shaded, stain_around
 from egs_warp.segmentation.plane_search import near_plane
 
 _MARGIN = 0.01
-"""Fraction of the hole's side by which the hole is enlarged: the floor at its edge is stained by the object and by its
-shadow. Gaps in the floor that touch the hole are added in any case. With 0.03 and more, a sheet under a plush toy lost
+"""Fraction of the hole's side by which the hole is enlarged, because the object and its shadow stain the floor at the
+hole's edge. Gaps in the floor that touch the hole are always added. With 0.03 and more, a sheet under a plush toy lost
 part of its edge."""
 _THICKNESS = 0.15
-"""Fraction of the hole's side. Gaussians nearer to the plane than this are floor."""
+"""Fraction of the hole's side. Gaussians within this distance of the plane are floor."""
 _HAZE = 0.25
-"""Fraction of the hole's side. Gaussians over the hole and lower than this are floor, or haze at the object's foot."""
+"""Fraction of the hole's side. Gaussians over the hole that are lower than this are floor, or haze at the object's
+foot."""
 _KNOWN = 0.6
-"""Opacity of the floor above which its colour is trusted."""
+"""Minimum opacity of the floor at which its colour is known."""
 _SOLID = 0.3
-"""Opacity above which a Gaussian counts as floor."""
+"""Minimum opacity of a Gaussian that is floor."""
 _TEXELS_ACROSS = 120.0
-"""Texels along the side of the hole, for any size, so that the computing time does not depend on the size."""
+"""Texels along the side of the hole, whatever its size, so that the computing time does not depend on the size."""
 _WINDOW = 3.0
-"""Side of the window as a multiple of the hole's side. It contains the hole and the floor that may be copied."""
+"""Side of the window as a multiple of the hole's side. The window contains the hole and the floor to copy from."""
 _SHARPNESS = 0.5
 """Spacing of the new Gaussians as a fraction of the width of the floor's fine Gaussians."""
 _MAX_SPACING = 3
@@ -49,15 +50,15 @@ _MAX_SPACING = 3
 _RIM = 12
 """Width of the rim around the hole that takes part in the training, texels."""
 _GAP_REACH = 0.25
-"""Fraction of the hole's side. Gaps in the floor are followed up to this distance from the hole."""
+"""Maximum distance of gaps from the hole, as a fraction of the hole's side. Gaps farther away remain open."""
 _GAP_EDGE = 6.0
-"""Width, in texels, of the floor around such a gap that is not trusted either."""
+"""Width, in texels, of the unreliable floor around a gap; it is filled with the gap."""
 _CHANNEL = 9.0
-"""Half width, in texels. A narrower channel does not connect a gap to the space beyond the floor."""
+"""Half width, in texels. A channel narrower than this does not connect a gap to the empty space beyond the floor."""
 _MIN_RIM_FRACTION = 0.4
 """Minimum fraction of the hole's edge that must be floor."""
 _MAX_ISLAND_AREA = 0.15
-"""Fraction of the hole's area. Floor enclosed by the hole is discarded if it is smaller."""
+"""Fraction of the hole's area. A smaller island of floor inside the hole is discarded."""
 _COLOUR_WEIGHT = 4.0
 """Weight of the squared distance between a Gaussian's colour and the painted colour."""
 _PAINTING = 0.5
@@ -88,7 +89,7 @@ class InpaintResult:
     """A background with new floor."""
 
     cloud: GaussianCloud
-    """Scene units; first the retained Gaussians, then the new ones."""
+    """Background with the new floor, scene units; first the retained Gaussians, then the new ones."""
     is_new: np.ndarray
     """(n,) bool, True for new Gaussians."""
     removed: int
@@ -96,9 +97,9 @@ class InpaintResult:
     window: PlaneWindow
     """Window of the face-on view."""
     hole: np.ndarray
-    """(rows, columns) bool, on the window."""
+    """(rows, columns) bool, the filled hole on the window."""
     before: RectifiedImage
-    """The floor with its hole."""
+    """Face-on picture of the floor before the hole is filled."""
     painted: np.ndarray
     """(rows, columns, 3) float32, the inpainter's result."""
     seconds: dict[str, float]
@@ -115,7 +116,8 @@ def inpaint(
     options: InpaintOptions | None = None,
     progress: Callable[[float], None] = lambda done: None,
 ) -> InpaintResult:
-    """Close ``hole`` in the floor of ``background`` (scene units), replacing what lies in it or just above and below.
+    """Fill ``hole`` in the floor of ``background`` (scene units) with new Gaussians; those in the hole and near it are
+    removed.
 
     Args:
         background: the capture without the object.
@@ -148,7 +150,7 @@ def inpaint(
         raise UserError("inpaint: the hole covers the whole capture; make it smaller")
     retained = background.subset(~junk)
     clock.lap("rectify")
-    # Without a stain there is no shadow either, and dark floor keeps its own colour.
+    # Where there is no stain, there is no shadow either, and dark floor keeps its colour.
     shade = shaded(grown, known, before.colour) if stained else None
     painted = inpainter.fill(np.where(known[..., None], before.colour, 0.0), grown, known, shade)
     clock.lap("inpaint")
@@ -215,10 +217,10 @@ def _window_around(background: GaussianCloud, hole: Hole, margin: float) -> tupl
 def _in_hole(
     background: GaussianCloud, window: PlaneWindow, mask: np.ndarray, side: float, *, depth: float = 1.0
 ) -> np.ndarray:
-    """(n,) bool, True for Gaussians of the floor or of haze over the hole, and for those under the hole.
+    """(n,) bool, True for Gaussians in the hole of the ``mask``: floor, haze over it, and Gaussians under it.
 
-    Gaussians that hang higher are not included. Those below are included down to ``depth`` times the ``side`` of the
-    hole (scene units), because they are visible beyond the edge of a thin floor.
+    Gaussians that hang higher are not included. Gaussians below the plane are included down to ``depth`` times the
+    ``side`` of the hole (scene units), because they are visible beyond the edge of a thin floor.
     """
     means = background.means.numpy()
     heights = window.plane.heights(means)
@@ -226,8 +228,8 @@ def _in_hole(
 
 
 def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the hole with adjacent gaps and enclosed islands of floor, and the known floor; both (rows, columns)
-    bool."""
+    """Return the hole enlarged by adjacent gaps and by islands of floor inside it, and the known floor; both (rows,
+    columns) bool."""
     # Pinholes between splats are not gaps.
     closed: Any = ndimage.binary_closing(np.pad(alpha > _KNOWN, 4, mode="edge"), iterations=2)
     solid = np.asarray(closed[4:-4, 4:-4])
@@ -244,9 +246,10 @@ def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) -> tuple[np.ndarray, np.ndarray, float]:
-    """Add the stains around the hole, if enough floor remains to fill it from.
+    """Add the stains around the hole if enough floor remains to copy from.
 
-    Returns the hole and the known floor, both (rows, columns) bool, and the fraction of the hole that was stained.
+    Returns the hole and the known floor, both (rows, columns) bool, and the fraction of the enlarged hole that was
+    stained.
     """
     stain = stain_around(hole, known, before.colour)
     if not stain.any():
@@ -255,14 +258,14 @@ def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) 
     try:
         _check(whole, left)
     except UserError:
-        # Stained floor is better than no floor.
+        # Copying from stained floor is better than having too little floor to copy from.
         return hole, known, 0.0
     return whole, left, float((whole & ~hole).sum() / whole.sum())
 
 
 def _void(missing: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool, the part of the ``missing`` floor that lies beyond the floor's edge. Parts that are
-    connected to it by a narrow channel only are gaps."""
+    """(rows, columns) bool, the part of the ``missing`` floor that lies beyond the floor's edge. Parts connected to it
+    only by a narrow channel are gaps and are not included."""
     wide, _ = connected_parts(depth_inside(np.pad(missing, 1, mode="edge")) > _CHANNEL)
     edges = np.concatenate([wide[0], wide[-1], wide[:, 0], wide[:, -1]])
     outside = np.isin(wide, np.unique(edges[edges > 0]))[1:-1, 1:-1]

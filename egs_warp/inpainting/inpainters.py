@@ -15,9 +15,9 @@ from egs_warp.inpainting.patch_synthesis import PatchSynthesis
 from egs_warp.io.onnx import OnnxFile, read_onnx
 
 _PAD = 8
-"""LaMa takes pictures whose sides are multiples of this."""
+"""The sides of LaMa's input picture must be multiples of this number of pixels."""
 _MAX_UNIT_OUTPUT = 4.0
-"""A network with outputs above this uses the range 0 to 255, not 0 to 1."""
+"""A network whose largest output exceeds this value uses the range 0 to 255 instead of 0 to 1."""
 
 
 class Inpainter(Protocol):
@@ -32,7 +32,7 @@ class Inpainter(Protocol):
             image: (H, W, 3) float32, 0 to 1.
             hole: (H, W) bool, the pixels to fill.
             known: (H, W) bool, where ``image`` can be trusted outside the hole.
-            shade: (H, W) bool, shaded pixels that should not be copied to places in the light.
+            shade: (H, W) bool, shaded pixels that should not be copied to lit places.
 
         Returns:
             (H, W, 3) float32, 0 to 1, equal to ``image`` outside ``hole``.
@@ -46,7 +46,7 @@ class OpenCvMethod(enum.Enum):
     TELEA = "telea"
     """Fast marching (Telea 2004)."""
     NAVIER_STOKES = "ns"
-    """Isophotes continued into the hole (Bertalmio et al. 2001)."""
+    """Continuation of isophotes into the hole (Bertalmio et al. 2001)."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class TorchScriptInpainter:
 
     path: Path
     device: str = "cpu"
-    """PyTorch device."""
+    """PyTorch device on which the network runs."""
 
     def fill(
         self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None

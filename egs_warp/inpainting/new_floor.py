@@ -1,4 +1,4 @@
-"""Flat Gaussians for a piece of floor: their positions, and their view-dependent colour."""
+"""Flat Gaussians for a region of floor: their positions, and their view-dependent colour."""
 
 from __future__ import annotations
 
@@ -24,11 +24,10 @@ _SKIRT_DROP = 0.5
 _RIM_SMOOTHING = 3.0
 """Standard deviation, in texels, of the blur of the floor's height at the rim."""
 _OUTLIER = 2.0
-"""Heights are clipped at this many deviations from the tilted plane through the rim, to remove cracks and blades of
-grass.
-"""
+"""Heights are clipped at this many robust standard deviations from the tilted plane through the rim, to remove cracks
+and blades of grass."""
 _NEIGHBOURS = 512
-"""Number of Gaussians of the old floor from which a new one takes its gloss. A few from one part of the rim could be
+"""Number of Gaussians of the old floor whose mean gloss a new Gaussian takes. Fewer, from one part of the rim, could be
 mostly haze."""
 _GLOSS_CELL = 4.0
 """Cell size in texels. New Gaussians in one cell have the same gloss."""
@@ -71,8 +70,8 @@ def flat_gaussians(
 ) -> GaussianCloud | None:
     """Create flat Gaussians of SH degree 0 over a hole and its known rim.
 
-    Those of the rim lie a little lower, so that they are visible only through gaps. Returns None if the hole is
-    narrower than a block of ``spacing`` x ``spacing`` texels everywhere.
+    The Gaussians over the rim lie a little lower, so that they are visible only through gaps. Returns None if the hole
+    is narrower than a block of ``spacing`` x ``spacing`` texels everywhere.
 
     Args:
         window: the plane and its grid of texels.
@@ -98,7 +97,7 @@ def flat_gaussians(
     first, second = window.plane.tangents()
     step = spacing * window.texel
     log_scales = np.full((count, 3), np.log(_WIDTH * step))
-    # The paper's thickness, unless the scene is so small that this would not be flat.
+    # Use the paper's thickness, unless the scene is so small that Gaussians of this thickness would not be flat.
     log_scales[:, 2] = min(-10.0, float(np.log(0.05 * step)))
     height = blocks(heights)[rows, columns] - np.where(inner[rows, columns], 0.0, _SKIRT_DROP * step)[:, None]
     places = window.points((np.stack([columns, rows], axis=1) + 0.5) * spacing)
@@ -114,7 +113,7 @@ def flat_gaussians(
 
 
 def with_gloss(new: GaussianCloud, floor: GaussianCloud, window: PlaneWindow) -> GaussianCloud:
-    """Return ``new`` (SH degree 0) with the gloss of ``floor``: the higher SH bands of its nearest Gaussians.
+    """Return ``new`` (SH degree 0) with the gloss of ``floor``, which is the higher SH bands of its nearest Gaussians.
 
     The mean colour over all directions is unchanged.
     """

@@ -17,28 +17,28 @@ from egs_warp.geometry.bitmaps import connected_parts, depth_inside
 from egs_warp.inpainting.rim_colours import RimColours
 
 _PIECES = (5, 10)
-"""Radii, in pixels, of the pieces of the rim that are matched to similar regions, in addition to the whole rim."""
+"""Radii, in pixels, of the parts of the rim that are matched to similar regions, in addition to the whole rim."""
 _RING = 6
 """Width in pixels of the ring around the hole that is compared."""
 _MIN_PIXELS = 15
-"""Minimum number of pixels of a piece."""
+"""Minimum number of pixels in such a part."""
 _OFFSETS_PER_PIXEL = 3
-"""Number of best offsets of each pixel; all other offsets are discarded."""
+"""Number of best offsets at each pixel; an offset that is never among them is discarded."""
 _RIM = 3
 """Width in pixels of the rim around the hole that a copy must also match."""
 _COST_UNIT = 2000.0
-"""Capacities are integers: colour differences are counted in units of 1 / 2000."""
+"""Capacities are integers: one unit is a colour difference of 1 / 2000."""
 _PRIOR = 0.5
 """Weight of the agreement of an offset with the known surroundings of a pixel, relative to the cost of seams."""
 _SEAM = 0.03
-"""Cost of an invisible seam, as a colour difference; it favours large pieces."""
+"""Cost of an invisible seam, as a colour difference; it favours large copied regions."""
 _SWEEPS = 3
 """Maximum number of rounds of expansion over all offsets."""
 _ATTEMPTS = 4
 """Maximum number of attempts to paint the hole without islands of colours that its rim does not have."""
 _ALIKE = 0.05
-"""Mean colour difference around a pixel below which an offset may paint it in any colour, because the picture repeats.
-"""
+"""Mean colour difference around a pixel below which an offset may paint the pixel in any colour, because the picture
+repeats there."""
 _FORBIDDEN = 50_000_000
 
 
@@ -57,7 +57,7 @@ def labelled_sources(
 ) -> np.ndarray:
     """Choose the source of every pixel of ``hole`` and its rim so that seams are least visible.
 
-    Pixels outside, and pixels of holes around which nothing repeats, are their own sources.
+    Pixels outside, and pixels of holes with no repeating surroundings, are their own sources.
 
     Args:
         image: (H, W, 3) float32.
@@ -83,7 +83,7 @@ def labelled_sources(
 
 
 def _candidates(image: np.ndarray, part: np.ndarray, hole: np.ndarray, known: np.ndarray, limit: float) -> Offsets:
-    """Return the offsets under which pieces of the rim of ``part``, of several sizes, are most similar to other
+    """Return the offsets under which parts of the rim of ``part``, of several sizes, are most similar to other
     regions."""
     usable = (known & ~hole).astype(np.float32)
     rim = np.argwhere(np.logical_and(ndimage.binary_dilation(part), usable > 0.0))
@@ -102,8 +102,8 @@ def _candidates(image: np.ndarray, part: np.ndarray, hole: np.ndarray, known: np
 
 
 def _spread_out(points: np.ndarray, spacing: float) -> np.ndarray:
-    """Return a subset of ``points`` (n, 2) that are at least ``spacing`` apart and leave none farther away than
-    that."""
+    """Return a subset of ``points`` (n, 2) such that its points are at least ``spacing`` apart and every other point is
+    within ``spacing`` of one of them."""
     left, chosen = points, []
     while len(left):
         chosen.append(left[0])
@@ -114,8 +114,8 @@ def _spread_out(points: np.ndarray, spacing: float) -> np.ndarray:
 def _alike(
     image: np.ndarray, part: np.ndarray, usable: np.ndarray, centre: np.ndarray, radius: int, count: int, limit: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the best ``count`` offsets, and the colour shift of each, for the known pixels within ``radius`` of
-    ``centre`` and near ``part``."""
+    """Return the best ``count`` offsets, and the colour shift of each, at which the known pixels within ``radius`` of
+    ``centre`` and near ``part`` match other regions."""
     low = np.maximum(centre - radius, 0)
     high = np.minimum(centre + radius + 1, part.shape)
     window = (slice(low[0], high[0]), slice(low[1], high[1]))
@@ -148,8 +148,8 @@ def _label(
     domain: np.ndarray,
     offsets: Offsets,
 ) -> np.ndarray:
-    """(n, 2) offset of each pixel of ``domain`` (n, 2), by expansion moves over ``offsets`` and over added ones that
-    provide missing colours."""
+    """(n, 2) offset of each pixel of ``domain`` (n, 2), found by expansion moves over ``offsets`` and over additional
+    offsets that provide missing colours."""
     in_hole = hole[domain[:, 0], domain[:, 1]]
     colours = RimColours(image, known & ~hole, domain)
     place, allowed = _places(domain, offsets, is_source)
@@ -236,8 +236,8 @@ def _expanded(labels: np.ndarray, data: np.ndarray, colour: np.ndarray, p: np.nd
 
 
 def _places(domain: np.ndarray, offsets: Offsets, is_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the position (n, k, 2) that each offset leads to from each pixel, clipped to the picture, and (n, k) bool:
-    True if it is a source."""
+    """Return (n, k, 2), the source of each pixel at each offset, clipped to the picture, and (n, k) bool, True if that
+    source is allowed."""
     place = domain[:, None] + offsets.steps[None]
     bounded = np.clip(place, 0, np.array(is_source.shape) - 1)
     return bounded, (place == bounded).all(axis=-1) & is_source[bounded[..., 0], bounded[..., 1]]

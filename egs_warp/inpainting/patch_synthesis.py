@@ -1,8 +1,8 @@
 """Patch-based inpainting from the rest of the same picture: patch search and voting over a pyramid.
 
-Wexler, Shechtman, Irani 2007 (voting over scales); Barnes et al. 2009 (PatchMatch); He and Sun 2012 (few good offsets
-as a start); Darabi et al. 2012 (a colour shift for each patch, so that light may change across the hole). The kernels
-are in ``egs_warp/kernels/inpainting/patch_synthesis.py``.
+Sources: Wexler, Shechtman, Irani 2007 (voting over scales); Barnes et al. 2009 (PatchMatch); He and Sun 2012 (few good
+offsets as a start); Darabi et al. 2012 (a colour shift for each patch, so that light may change across the hole). The
+kernels are in ``egs_warp/kernels/inpainting/patch_synthesis.py``.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _COARSEST_HALF_WIDTH = 16.0
 _STRIDES = (8, 4, 2, 1, 8, 4, 2, 1)
 """Distances of the neighbours whose sources are tried in one search, pixels."""
 _TOLERANCE = 0.5
-"""A patch whose cost is this multiple of the median cost has the weight 1 / e."""
+"""A patch whose cost is this multiple of the median cost has the weight 1/e."""
 _MIN_LIT_FRACTION = 0.5
-"""Fraction of the sources that must remain when shaded ones are excluded."""
+"""Minimum fraction of the sources that must remain when shaded sources are excluded."""
 _SCREEN = 0.01
 """Weight of the voted colours relative to the gradients of the sources. The colours dominate beyond about 1 /
 sqrt(weight) pixels."""
 _STRICT_TOLERANCE = 0.25
-"""Tolerance of the last vote of each level, so that the result is as sharp as its sources."""
+"""Tolerance of the last vote at each level, smaller so that the result is as sharp as its sources."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class PatchSynthesis:
     rounds: int = 4
     """Rounds of search and voting at each level."""
     shift_limit: float = 0.02
-    """Largest change of colour of a patch, 0 to 1. A large value turns one colour of a pattern into the other."""
+    """Maximum change of colour of a patch, 0 to 1. A large value turns one colour of a pattern into another."""
     seed: int = 0
     device: str | None = None
 
@@ -93,13 +93,13 @@ class _Level:
         if lit.sum() >= _MIN_LIT_FRACTION * is_source.sum():
             is_source = lit
         targets = ndimage.binary_dilation(hole, square)
-        # Deep in the hole the current guess counts less than near its rim.
+        # Deep in the hole, the current guess has less weight than near the rim.
         confidence = np.where(hole, 1.3 ** -depth_inside(hole), np.where(known, 1.0, 0.0))
         return cls(image, hole, known, is_source, targets, np.maximum(confidence, 1e-4).astype(np.float32), shade)
 
 
 def _pyramid(image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray) -> list[_Level]:
-    """Return the levels, finest first; each has half the size of the one before."""
+    """Return the levels, finest first; each has half the resolution of the previous one."""
     levels = [_Level.of(image.astype(np.float32), hole, known, shade)]
     while depth_inside(np.pad(levels[-1].hole, 1)).max() > _COARSEST_HALF_WIDTH:
         fine = levels[-1]
@@ -120,8 +120,8 @@ def _with_half_turn(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Append the picture rotated by 180 degrees, as a source of patches.
 
-    Matches of an edge or a corner often occur in the opposite direction only. A strip between the two separates the
-    patches.
+    Matches of an edge or a corner often occur only in the opposite orientation. A strip between the two pictures keeps
+    patches from spanning both.
     """
 
     def side_by_side(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -133,7 +133,7 @@ def _with_half_turn(
 
 
 def _start(level: _Level, shift_limit: float) -> np.ndarray:
-    """(H, W, 2) int32, a source with a whole known patch for every pixel, from the offsets that match the rim."""
+    """(H, W, 2) int32, a source with a whole known patch for each pixel, from the offsets that match the rim."""
     sources = labelled_sources(level.image, level.hole, level.known, level.is_source, shift_limit=shift_limit)
     return _with_whole_patches(sources, level)
 
@@ -155,7 +155,7 @@ def _with_whole_patches(sources: np.ndarray, level: _Level) -> np.ndarray:
 def poisson_blend(picture: np.ndarray, hole: np.ndarray, known: np.ndarray, sources: np.ndarray) -> np.ndarray:
     """Return the ``picture`` (H, W, 3) with the gradients of its ``sources`` (H, W, 2) in the ``hole`` (H, W) bool.
 
-    A screened Poisson equation (Bhat et al. 2008) joins pieces from differently lit places without a seam.
+    The screened Poisson equation (Bhat et al. 2008) joins regions copied from differently lit places without a seam.
     """
     at = np.argwhere(hole)
     index = np.full(hole.shape, -1)
@@ -171,7 +171,7 @@ def poisson_blend(picture: np.ndarray, hole: np.ndarray, known: np.ndarray, sour
         rise = picture[ahead[:, 0], ahead[:, 1]].astype(np.float64) - picture[source[:, 0], source[:, 1]]
         other = index[there[:, 0], there[:, 1]]
         free = inside & (other >= 0)
-        # Between two pixels of the hole, the gradient is the mean of both sources.
+        # Between two pixels of the hole, the gradient is the mean of the gradients at both sources.
         from_other = sources[there[:, 0], there[:, 1]]
         behind = np.clip(from_other - step, 0, limit)
         of_other = picture[from_other[:, 0], from_other[:, 1]].astype(np.float64) - picture[behind[:, 0], behind[:, 1]]
@@ -201,7 +201,7 @@ class _Work:
         self._reach = max(level.hole.shape)
         self._holes_at, self._targets_at = np.argwhere(level.hole), np.argwhere(level.targets)
         self.picture = level.image.copy()
-        """(H, W, 3) float32."""
+        """(H, W, 3) float32, colours of the level."""
 
         def upload(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self._device)
@@ -240,8 +240,8 @@ class _Work:
             self._sources, self._next = self._next, self._sources
 
     def vote(self, tolerance: float) -> None:
-        """Paint the hole with the weighted mean of the overlapping patches. ``tolerance`` is a multiple of the median
-        cost."""
+        """Paint the hole with the weighted mean of the overlapping patches. ``tolerance`` is the cost of a patch with
+        the weight 1/e, as a multiple of the median cost."""
         costs = self._cost.numpy()[self._targets_at[:, 0], self._targets_at[:, 1]]
         launch_rows(
             vote_kernel,

@@ -1,4 +1,4 @@
-"""Face-on views of the plane: a window of square texels on it, and pictures of what lies there."""
+"""Face-on views of the plane: a window of square texels on the plane, and pictures of the surface in it."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_search import near_plane
 
 _ELEVATION_DEGREES = 40.0
-"""Elevation in degrees above the plane of the views from all around. Floors are usually seen from there, but hardly
-ever from straight above."""
+"""Elevation above the plane, degrees, of the side views. Photos usually show floors from about this elevation, and
+hardly ever from straight above."""
 
 _SIDE_VIEWS = 8
 _PIXELS_PER_TEXEL = 1.5
@@ -27,10 +27,10 @@ _PIXELS_PER_TEXEL = 1.5
 _SMOOTHING = 1.0
 """Standard deviation, in texels, of the blur of the heights onto which the side views are projected."""
 _DETAIL = 4.0
-"""Standard deviation, in texels, of a blur; finer structure counts as detail."""
+"""Standard deviation, in texels, of a blur; structure that it removes is detail."""
 _BLUR, _MAX_DISAGREEMENT = 2.0, 0.1
 """Standard deviation of a blur in texels, and fraction of full brightness. Where a blurred view differs from the median
-by more than that fraction, it probably shows something other than the floor."""
+of all views by more than this fraction, it probably shows something other than the floor."""
 _MIN_ALPHA = 1e-3
 """Opacity below which a pixel is empty."""
 
@@ -134,7 +134,7 @@ class RectifiedImage:
     colour: np.ndarray
     """(rows, columns, 3) float32, 0 to 1; black where it is empty."""
     alpha: np.ndarray
-    """(rows, columns) float32, 0 to 1."""
+    """(rows, columns) float32, opacity, 0 to 1."""
     height: np.ndarray
     """(rows, columns) float32, height of the surface above the plane, scene units; 0 where it is empty."""
 
@@ -166,9 +166,9 @@ def diffuse_only(cloud: GaussianCloud, plane: Plane) -> GaussianCloud:
 def rectify(cloud: GaussianCloud, window: PlaneWindow, *, thickness: float) -> RectifiedImage:
     """Render the Gaussians of ``cloud`` within ``thickness`` (scene units) of the window's plane, face-on.
 
-    Height and opacity come from a view straight down. The colour is the mean of views from all around, each projected
-    at that height, plus the detail of the view with median contrast. Directly from above, where no photo was taken, a
-    capture's threads and gaps are disordered.
+    Height and opacity come from a view straight down. The colour is the mean of side views, each projected onto the
+    surface at that height, plus the detail of the side view with median contrast. The view straight down is not used
+    for colour: no photo was taken from there, and a capture shows disordered threads and gaps.
     """
     shape = (window.rows, window.columns)
     chosen = near_plane(cloud, window.plane, thickness)
@@ -188,8 +188,7 @@ def rectify(cloud: GaussianCloud, window: PlaneWindow, *, thickness: float) -> R
 def _from_all_around(
     floor: GaussianCloud, window: PlaneWindow, solid: np.ndarray, height: np.ndarray, otherwise: np.ndarray
 ) -> np.ndarray:
-    """(rows, columns, 3) colour of the ``floor``.
-
+    """(rows, columns, 3) colour of the ``floor`` from side views.
     Args:
         floor: its Gaussians.
         window: the window on the plane.
@@ -204,14 +203,14 @@ def _from_all_around(
     places += level.reshape(-1, 1) * window.plane.normal
     views = [_side_view(floor, window, places, 2.0 * np.pi * number / _SIDE_VIEWS) for number in range(_SIDE_VIEWS)]
     colours = [colour / np.maximum(alpha, _MIN_ALPHA)[..., None] for colour, alpha in views]
-    # Beyond an edge, some views show what lies behind it.
+    # Beyond the floor's edge, some views show what lies behind it.
     broad = np.array([ndimage.gaussian_filter(colour, (_BLUR, _BLUR, 0.0)) for colour in colours])
     odds = np.abs(broad - np.median(broad, axis=0)).mean(axis=-1)
     agree = np.exp(-np.square(odds / _MAX_DISAGREEMENT))
     weights = agree * np.array([alpha for _, alpha in views])
     opacity = weights.sum(axis=0)
     mean = np.einsum("khw,khwc->hwc", weights, np.array(colours)) / np.maximum(opacity, _MIN_ALPHA)[..., None]
-    # The mean is blurred, because points that lie higher or lower are displaced differently in each view.
+    # The mean is blurred, because a point above or below the smoothed surface is displaced differently in each view.
     details = [_detail(one, alpha * solid) for one, (_, alpha) in zip(colours, views, strict=True)]
     middling = int(np.argsort([np.square(one).sum() for one in details])[_SIDE_VIEWS // 2])
     mean += agree[middling][..., None] * (details[middling] - _detail(mean, np.minimum(opacity, 1.0) * solid))

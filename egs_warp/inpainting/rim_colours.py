@@ -1,4 +1,4 @@
-"""Colours that each part of a hole may have, judged by the colours of its rim."""
+"""Colours that each region of a hole may have, derived from the colours of its rim."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from egs_warp.geometry.bitmaps import connected_parts, nearest_set
 from egs_warp.geometry.laplace_fill import laplace_fill
 
 _SHADE = 0.1
-"""Colours closer to each other than this count as the same."""
+"""Colours closer to each other than this belong to the same shade."""
 _LINE = 5
-"""Pixels. Structure narrower than half of this is not judged: lines cross a hole although little of its rim has their
-colour."""
+"""Pixels. Structure narrower than half of this is not tested, because a line may cross a hole although little of the
+rim has its colour."""
 _COMMON = 0.55
-"""A colour at least this likely, relative to the most likely one, may stand alone."""
+"""Minimum likelihood of a colour that may form an island, relative to the most likely colour."""
 _PATTERN = 0.5
-"""If no colour is more likely than this, the floor has a pattern and no colour is unusual."""
+"""If no colour is more likely than this, the floor has a pattern, and no colour is unusual."""
 _TOUCH = 2
 """Pixels around an island in which the rim is examined."""
 _MAX_ADDED = 12
@@ -28,7 +28,8 @@ class RimColours:
     """Colours of a picture (H, W, 3), grouped into shades, and the likelihood of each shade at the pixels ``domain``
     (n, 2) of a hole.
 
-    The likelihood is the probability that a random walk from the pixel ends at a rim pixel of that shade.
+    The likelihood of a shade at a pixel is the probability that a random walk from the pixel ends at a rim pixel of
+    that shade.
     """
 
     def __init__(self, image: np.ndarray, usable: np.ndarray, domain: np.ndarray) -> None:
@@ -74,8 +75,8 @@ class RimColours:
         return found[rows, columns]
 
     def offsets_for(self, uncovered: np.ndarray, is_source: np.ndarray) -> list[np.ndarray]:
-        """Return offsets (2,) int under which the ``uncovered`` (n,) bool pixels get common colours from ``is_source``
-        (H, W), in pieces as large as possible."""
+        """Return offsets (2,) int under which the sources in ``is_source`` (H, W) give the ``uncovered`` (n,) bool
+        pixels common colours. Each offset covers as many pixels as possible."""
         uncovered, found = uncovered.copy(), []
         while uncovered.any() and len(found) < _MAX_ADDED:
             at, common = self._domain[uncovered], self._common[uncovered]

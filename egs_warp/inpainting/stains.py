@@ -1,5 +1,5 @@
-"""Stains of an object on the floor around its hole: the shadow, and remnants of its foot that the capture painted onto
-the floor.
+"""Stains of an object on the floor around its hole: its shadow, and remnants of its foot in the colours of the captured
+floor.
 
 Both are darker than the floor.
 """
@@ -21,16 +21,17 @@ _BROAD = 12.0
 _DARKER = 0.2
 """Difference of the natural logarithm of brightness. Weaker darkening is hardly visible."""
 _SHADE, _SHADE_BLUR = 0.1, 4.0
-"""Difference of the natural logarithm of brightness, and standard deviation of a blur in texels. Floor that is darker
-by more after such a blur is not copied."""
+"""Difference of the natural logarithm of brightness, and standard deviation of a blur in texels. Floor whose blurred
+brightness is lower than predicted by more than this difference is not copied."""
 _END = 4.0
-"""Distance from the floor's end in texels. The shadow of what stood in the hole does not extend so far."""
+"""Distance from the floor's edge in texels. The shadow of an object in the hole does not reach this close to the
+edge."""
 _UNUSUAL = 3.0
-"""Number of standard deviations (robust) of the floor far from the hole. Weaker darkening is the pattern of the
-floor."""
+"""Number of robust standard deviations of the floor far from the hole. Weaker darkening is part of the floor's
+pattern."""
 _ALIKE, _COMMON = 0.1, 0.02
-"""Largest difference of the natural logarithm, in every channel, between colours that count as the same; and the
-fraction of the floor far from the hole that has a colour of a pattern, such as the blue of a checked cloth."""
+"""Maximum difference of the natural logarithm, in every channel, between equal colours; and the minimum fraction of the
+floor far from the hole that has a colour of the floor's pattern, such as the blue of a checked cloth."""
 _SAMPLE = 2000
 """Maximum number of texels of the floor from which common colours are determined."""
 _MIN_BRIGHTNESS = 0.02
@@ -38,12 +39,12 @@ _MIN_BRIGHTNESS = 0.02
 _EVERY = 3
 """Sampling step in texels."""
 _ROUNDS = 4
-"""Maximum number of rounds. The floor far from the hole may be stained too, until an earlier round has added that stain
-to the hole."""
+"""Maximum number of rounds. The floor from which brightness is predicted may itself be stained, until an earlier round
+has added that stain to the hole."""
 _FEW = 20
-"""Texels. A stain that grows by fewer is complete."""
+"""Texels. The search ends when a round adds fewer."""
 _REACH = 60.0
-"""Texels, half of the hole's side. A stain does not extend farther from the hole."""
+"""Texels, equal to half of the hole's side: maximum distance of a stain's texels from the hole."""
 _MAX_AREA = 2.0
 """Maximum area of a stain, as a multiple of the hole's area; a larger region is another part of the floor."""
 
@@ -51,9 +52,10 @@ _MAX_AREA = 2.0
 def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
     """(rows, columns) bool, the stained part of the floor.
 
-    It is connected to the hole and darker, in any channel, than the floor farther out predicts. The half of the floor
-    that is farther from the hole gives the prediction and is not stained. Regions that reach farther than half of the
-    hole's side are not stains, and the result is empty if the stain exceeds twice the hole's area.
+    A stain is connected to the hole and, in at least one channel, darker than predicted from the floor farther out. The
+    prediction uses the half of the floor that is farther from the hole; this half is never stained. Regions that extend
+    from the hole by more than half of its side are not stains, and the result is empty if the stain exceeds twice the
+    hole's area.
 
     Args:
         hole: (rows, columns) bool.
@@ -93,17 +95,17 @@ def _next_to(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndar
 
 
 def shaded(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool, the part of the ``known`` (rows, columns) floor that is darker overall than the floor
-    farther from the ``hole`` (rows, columns) predicts.
+    """(rows, columns) bool, the part of the ``known`` (rows, columns) floor whose mean brightness is lower than
+    predicted from the floor farther from the ``hole`` (rows, columns).
 
-    This need not be a stain, but copies of it would bring shadows to places that had none.
+    It need not be a stain, but copies of it would bring shadows to lit places.
     """
     floor = known & ~hole
     if not floor.any():
         return np.zeros_like(hole)
     _, _, off = _unexpected(floor, hole, colour, _SHADE_BLUR)
     shade = floor & (off.mean(axis=-1) < -_SHADE)
-    # A seam or a dark plank extends to the floor's end.
+    # A seam or a dark plank extends to the edge of the floor.
     parts, _ = connected_parts(shade)
     end = distance_to(np.pad(~(known | hole), 1, constant_values=True))[1:-1, 1:-1] <= _END
     return shade & ~np.isin(parts, np.unique(parts[shade & end]))
@@ -125,15 +127,15 @@ def _unexpected(
 
 
 def _common(colours: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """(n,) bool, True for ``colours`` (n, 3) that many of the ``floor`` (m, 3) have; all are logarithms."""
+    """(n,) bool, True for ``colours`` (n, 3) that are common among the ``floor``'s (m, 3); all are logarithms."""
     few = floor[:: -(-len(floor) // _SAMPLE)]
     alike = KDTree(few).query_ball_point(colours, _ALIKE, p=np.inf, return_length=True)
     return np.asarray(alike) >= _COMMON * len(few)
 
 
 def _extended(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Extend smooth ``values`` (rows, columns, 3) from where they are ``known`` (rows, columns) bool by Laplace's
-    equation, solved on every third row and column."""
+    """Extend smooth ``values`` (rows, columns, 3) from the ``known`` (rows, columns) bool texels to all others by
+    Laplace's equation, solved on every third row and column."""
     few = (slice(None, None, _EVERY),) * 2
     film = laplace_fill(np.where(known[few][..., None], values[few], 0.0), ~known[few])
     whole = cv2.resize(film, known.shape[::-1], interpolation=cv2.INTER_LINEAR)

@@ -1,4 +1,4 @@
-"""Closing of the underside of an object that stood on uneven or soft ground; no view shows it."""
+"""Closing of an object's underside, which no view shows, after it stood on uneven or soft ground."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from egs_warp.inpainting.new_floor import flat_gaussians
 from egs_warp.inpainting.rectified import PlaneWindow
 
 _LOW = 0.03
-"""Fraction of the object's size. Gaussians closer to the ground are the object's rim."""
+"""Fraction of the object's size. Gaussians lower than this above the ground are the object's rim."""
 _TEXELS = 128
 """Texels across the rim."""
 _SPACING = 2
@@ -24,18 +24,18 @@ _SPACING = 2
 _MAX_GROWTH = 0.2
 """Maximum number of new Gaussians, as a fraction of the object's."""
 _BRIDGED = 8.0
-"""Texels. Gaps in the rim up to twice as wide are bridged."""
+"""Texels. Gaps in the rim up to twice this width are bridged."""
 _REACH = 2.0
-"""Number of standard deviations around the mean of a splat that count as covered."""
+"""Radius, in standard deviations of a splat, of the region around its mean that it covers."""
 _FOOT = 0.05
-"""Fraction of the texels that the rim encloses. With fewer unseen texels there is no open underside."""
+"""Minimum fraction of unseen texels among those that the rim encloses. With fewer there is no open underside."""
 
 
 def with_underside(object_cloud: GaussianCloud, ground: HeightField, size: float) -> tuple[GaussianCloud, int]:
     """Return the object with flat Gaussians over the opening that its rim at the ground encloses, and their number.
 
-    Heights and colours solve Laplace's equation with the values of the rim. There are at most a fifth as many new
-    Gaussians as the object has.
+    Heights and colours solve Laplace's equation with the rim's values as boundary values. The number of new Gaussians
+    is at most a fifth of the object's.
 
     Args:
         object_cloud: Gaussians of the object, scene units.

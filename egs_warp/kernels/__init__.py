@@ -1,5 +1,4 @@
-"""All Warp kernels and device functions, by package of their host code. Imports: warp, ``precision`` and each other.
+"""All Warp kernels and device functions, by package. They import only warp, ``precision`` and each other.
 
-Input: Warp arrays. Output: Warp arrays with the quantities of the paper's equations, computed by one thread or block
-for each element.
+Input: Warp arrays. Output: Warp arrays with the quantities of the paper's equations, one thread or block per element.
 """

@@ -1,7 +1,7 @@
-"""C++ source of dense linear algebra on a CPU, for native functions.
+"""C++ source code of dense linear algebra on a CPU, for native functions.
 
-The inner kernel updates four rows by eight columns, which fit the vector registers. Clang maps the vector types and
-fused multiply-adds to the instructions of the processor.
+The inner kernel updates blocks of four rows by eight columns, which fit the vector registers. Clang maps the vector
+types and fused multiply-adds to the instructions of the processor.
 """
 
 BLOCK = 16

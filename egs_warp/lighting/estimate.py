@@ -1,7 +1,7 @@
 """Estimate the main light of a capture from the shadow of its object on the ground and from the object's shading.
 
-Each candidate of the light's direction is judged by the shadow that the object would cast and by the surfaces that
-would be lit. Both are compared with the logarithm of the captured brightness by linear regression.
+For each candidate direction of the light, the shadow that the object would cast on the ground and the surfaces that
+would be lit are compared with the logarithm of the captured brightness by linear regression.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from egs_warp.lighting.evidence import GroundEvidence, ShadingEvidence
 
 _AZIMUTHS = 16
 _ELEVATIONS = (22.0, 38.0, 54.0, 70.0)
-"""Azimuths, and elevations in degrees, of the first candidates."""
+"""Elevations of the first candidates, degrees; each is combined with ``_AZIMUTHS`` azimuths."""
 _HALF_ANGLES = (2.0, 6.0, 14.0)
 """Candidates of the light's half angle, degrees."""
 _FIRST_HALF_ANGLE = 6.0
@@ -27,21 +27,22 @@ _STEPS = (10.0, 5.0, 2.5)
 """Steps of the refinement of the direction, degrees."""
 _ELEVATION_RANGE = (12.0, 80.0)
 _APART = 60.0
-"""Difference of azimuth from which another candidate is a rival, degrees."""
+"""Minimum difference of azimuth between the best candidate and a rival, degrees."""
 _MIN_EVIDENCE = 0.18
-"""Smallest decrease of the logarithm of the unexplained variance, of ground and object together, of a clear light."""
+"""Minimum evidence of a clear light: decrease of the logarithm of the unexplained variance, ground and object
+together."""
 _MAX_RIVAL = 0.80
-"""Largest evidence of a rival of a clear light, relative to the best candidate."""
+"""Maximum evidence of a rival, relative to the best candidate; otherwise no light is clear."""
 _MIN_AGREEMENT = 0.7
-"""Smallest evidence of the best candidate, relative to the sum of what ground and object reach alone; each counts at
-most 1, because that of a capture without noise has no limit."""
+"""Minimum evidence of the best candidate, relative to the sum of the largest evidence of the ground alone and of the
+object alone. Each term is limited to 1, because the evidence of a capture without noise is unbounded."""
 _WEAK, _MAX_ANGLE, _MIN_ALONE = 0.4, 45.0, 0.05
-"""Below this evidence, ground and object must not point to directions that differ by more than this angle, degrees,
-where both are above the last number."""
+"""Evidence below which a light is weak; maximum angle, degrees, between the best directions by ground and by object for
+a weak light; and evidence that both must exceed for this limit to apply."""
 _MIN_SHADE = 0.04
-"""Smallest fraction of displayed brightness that a cast shadow removes; a paler one is not drawn."""
+"""Minimum fraction of displayed brightness that a cast shadow removes; a paler shadow is not drawn."""
 _KEY_WEIGHT = 2.0
-"""Weight of the depth of the shadow on the ground in the fit of the irradiance, relative to all surfaces."""
+"""Weight of the shadow's depth on the ground in the fit of the irradiance, relative to all surfaces together."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class LightEstimate:
     """Result of ``estimate_light``."""
 
     light: MainLight | None
-    """None if it is not clear."""
+    """The main light; None if no light is clear."""
     note: str
     """One line for the user."""
 
@@ -65,7 +66,7 @@ class _Candidate:
     ground: float
     shading: float
     depth: float
-    """Decrease of the natural logarithm of linear brightness in full shadow."""
+    """Decrease of the natural logarithm of linear brightness from full light to full shadow."""
 
     @property
     def evidence(self) -> float:
@@ -126,7 +127,7 @@ class _Search:
         )
 
     def refined(self, best: _Candidate) -> _Candidate:
-        """Return the best candidate near ``best``: half angle, then direction by steps that become smaller."""
+        """Return the best candidate near ``best``: a search over direction and half angle with decreasing steps."""
         low, high = _ELEVATION_RANGE
         for step in _STEPS:
             around = [
@@ -144,7 +145,7 @@ class _Search:
 
 
 def _is_conflict(best: _Candidate, by_ground: _Candidate, by_shading: _Candidate) -> bool:
-    """Return True if the best candidates of ground and object alone contradict each other."""
+    """Return True if the best candidates by ground and by object contradict each other."""
     angle = np.degrees(np.arccos(np.clip(by_ground.direction @ by_shading.direction, -1.0, 1.0)))
     is_apart = best.evidence < _WEAK and angle > _MAX_ANGLE and min(by_ground.ground, by_shading.shading) > _MIN_ALONE
     reached = min(best.ground, 1.0) + min(best.shading, 1.0)
@@ -159,11 +160,11 @@ def _azimuth_between(first: _Candidate, second: _Candidate) -> float:
 def _fitted_irradiance(
     shading: ShadingEvidence, up: np.ndarray, direction: np.ndarray, key_fraction: float | None
 ) -> np.ndarray:
-    """Return the quadratic form of the irradiance that fits the object's shading best.
+    """Return the quadratic form (4, 4) of the irradiance that fits the object's shading best.
 
-    It is that of a distant light and of an ambient light that changes with height, all non-negative. The albedo of each
-    group of surfaces is fitted in turn. ``key_fraction`` is the fraction of the light on the ground that the main
-    light gives, from the depth of its shadow; None if that is not known.
+    The irradiance is the sum of a distant light and an ambient light that changes with height, all non-negative. The
+    fit alternates with a fit of one albedo for each group of surfaces. ``key_fraction`` is the main light's fraction of
+    the irradiance on the ground, computed from the depth of its shadow; None if it is unknown.
     """
     rise, cosine = shading.normals @ up, np.clip(shading.normals @ direction, 0.0, None)
     # Ambient light from above and from below, and the main light.
@@ -180,7 +181,7 @@ def _fitted_irradiance(
         limit = 3.0 * np.median(np.abs(right - irradiance)) + 1e-6
         right = np.clip(right, irradiance - limit, irradiance + limit)
         if key_fraction is not None:
-            # On the ground, the main light gives the fraction f: (1 - f) key sin(elevation) = f ambient.
+            # On the ground, the main light contributes the fraction f: (1 - f) key sin(elevation) = f ambient.
             known = np.array([-key_fraction, 0.0, (1.0 - key_fraction) * max(float(direction @ up), 0.0)])
             rows = np.vstack([rows, _KEY_WEIGHT * np.sqrt(len(terms)) * known])
             right = np.append(right, 0.0)

@@ -18,41 +18,42 @@ from egs_warp.render.shadow import ShadowMap, shadow_blur_radius
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Luminance of linear sRGB colours."""
 _MIN_COLOUR = 0.02
-"""Smallest displayed colour that is distinguished from black."""
+"""Minimum displayed colour; darker colours are raised to it before a logarithm is taken."""
 _SOLID = 0.3
-"""Opacity from which a Gaussian counts as a surface."""
+"""Minimum opacity of a Gaussian that is part of a surface."""
 _GROUPS = 4
-"""Groups of surfaces by chromaticity; each has an albedo of its own."""
+"""Number of groups of surfaces by chromaticity; each has its own albedo."""
 _MAX_CASTERS, _MAX_SURFACES = 6_000, 6_000
 _REACH = 2.4
-"""Radius of the ground that is compared, in sizes of the object."""
+"""Radius of the compared ground, in sizes of the object."""
 _CELL = 0.06
 """Side of a cell of the ground, in sizes of the object."""
 _ON_GROUND = 0.06
-"""Largest height of Gaussians of the ground, in sizes of the object."""
+"""Maximum height of Gaussians of the ground, in sizes of the object."""
 _COVERED = 0.35
-"""Part of a cell that the object covers seen from above, from which no photo shows it."""
+"""Minimum coverage of a cell by the object, seen from above, relative to the most covered cell, at which no photo shows
+the cell."""
 _OUTLIER = 2.5
-"""Largest residual that counts in full, in robust standard deviations."""
+"""Limit to which residuals are clipped, in robust standard deviations."""
 _MIN_LIMIT = 1.0
-"""Residual of the natural logarithm that always counts in full: a deep shadow on plain ground is no outlier."""
+"""Minimum of that limit, as a difference of the natural logarithm: a deep shadow on plain ground is no outlier."""
 _AMBIENT = (0.06, 0.25)
-"""Radii of the darkening around an object that any light causes, in sizes of the object."""
+"""Blur radii of the darkening around an object under any light, in sizes of the object."""
 
 
 @dataclass(frozen=True)
 class Regression:
-    """Values from which everything is removed that other causes explain."""
+    """Values with the linear contributions of known causes removed."""
 
     basis: np.ndarray
-    """(n, k) orthonormal columns: the other causes."""
+    """(n, k) orthonormal basis of the known causes."""
     residual: np.ndarray
-    """(n,) values minus their projection on the other causes."""
+    """(n,) values minus their projection onto the known causes."""
     variance: float
 
     @classmethod
     def of(cls, values: np.ndarray, causes: np.ndarray) -> Regression:
-        """Remove the linear ``causes`` (n, k) from ``values`` (n,); outliers are moved to the limit."""
+        """Remove the linear contributions of ``causes`` (n, k) from ``values`` (n,); outliers are clipped."""
         basis, upper = np.linalg.qr(causes)
         basis = basis[:, np.abs(np.diag(upper)) > 1e-9 * np.abs(upper).max(initial=1.0)]
         residual = values - basis @ (basis.T @ values)
@@ -63,10 +64,11 @@ class Regression:
         return cls(basis, residual, float(residual @ residual))
 
     def judge(self, cause: np.ndarray) -> tuple[float, float]:
-        """Return the decrease of the logarithm of the variance by a further ``cause`` (n,), and its coefficient."""
+        """Return the decrease of the logarithm of the variance by an additional ``cause`` (n,), and the coefficient of
+        the cause."""
         left = cause - self.basis @ (self.basis.T @ cause)
         size = float(left @ left)
-        # A cause that hardly differs from the others is no evidence.
+        # A cause that is nearly a combination of the known ones is no evidence.
         if size <= 1e-3 * float(cause @ cause) or self.variance <= 0.0:
             return 0.0, 0.0
         product = float(left @ self.residual)
@@ -79,18 +81,18 @@ class GroundEvidence:
     """Brightness of the ground around an object."""
 
     caster: GaussianCloud | None
-    """The object, or a part of its Gaussians; None without ground."""
+    """The object, or a thinned subset of its Gaussians; None without ground."""
     plane: Plane
     centre: np.ndarray
-    """(3,) on the plane under the object."""
+    """(3,) point on the plane under the object."""
     size: float
     """Height of the object over the ground, or half of its width if that is larger."""
     points: np.ndarray
-    """(n, 3) on the ground."""
+    """(n, 3) points on the ground."""
     log_brightness: np.ndarray
     """(n,) natural logarithm of linear luminance."""
     causes: np.ndarray | None
-    """(n, k) what else brightness depends on: albedo, place, ambient light, slope; None if too little is visible."""
+    """(n, k) other causes of brightness: albedo, position, ambient light, slope; None if too little is visible."""
     regression: Regression | None
 
     @property
@@ -127,7 +129,7 @@ class GroundEvidence:
         x, y = flat.T
         smooth = np.column_stack([x, y, x * x, x * y, y * y, *around])
         if isinstance(ground, HeightField):
-            # The shading of its folds.
+            # Shading by the slopes of the ground.
             smooth = np.column_stack([smooth, ground.frames(points)[:, 0] @ axes.T])
         smooth = smooth[visible]
         causes = np.column_stack([_indicators(albedo_groups(colours[visible])), smooth])
@@ -135,16 +137,16 @@ class GroundEvidence:
         return cls(caster, plane, centre, size, points[visible], values, causes, Regression.of(values, causes))
 
     def judge(self, light: MainLight) -> tuple[float, float]:
-        """Return the evidence of the shadow of ``light``, and the decrease of the logarithm of brightness in it; both
-        are zero if the ground is brighter there."""
+        """Return the evidence for the shadow of ``light``, and the decrease of the logarithm of brightness in the
+        shadow; both are zero if the ground is brighter there."""
         if self.regression is None:
             return 0.0, 0.0
         evidence, coefficient = self.regression.judge(self.shadow(light))
         return (evidence, -coefficient) if coefficient < 0.0 else (0.0, 0.0)
 
     def shadow(self, light: MainLight | None, spread: float = 0.0) -> np.ndarray:
-        """Return the shadow (n,) of the object on the points: of a light, or, spread by a fraction of the size, of the
-        sky."""
+        """Return the shadow (n,) of the object on the points: the shadow of ``light`` or, if None, of the sky, blurred
+        by ``spread`` times the object's size."""
         return shadow_on(self.points, self.caster, self.plane, self.centre, self.size, light, spread * self.size)
 
 
@@ -166,7 +168,7 @@ def shadow_on(
         centre: (3,) on the plane under the object.
         size: size of the object.
         light: main light; None casts straight down.
-        spread: blur radius in addition to that of the Gaussians.
+        spread: blur radius in addition to the Gaussians' own blur, scene units.
     """
     assert caster is not None
     grain = float(np.hypot(shadow_blur_radius(caster), spread))
@@ -189,7 +191,7 @@ class ShadingEvidence:
     """Brightness and normals of an object's surfaces."""
 
     normals: np.ndarray
-    """(n, 3) unit vectors."""
+    """(n, 3) unit normals of the surfaces."""
     log_brightness: np.ndarray
     """(n,) natural logarithm of linear luminance."""
     groups: np.ndarray
@@ -210,12 +212,13 @@ class ShadingEvidence:
         groups, values = albedo_groups(colours), log_luminance(colours)
         heights = cloud.means.numpy().astype(np.float64)[known] @ up
         heights = (heights - heights.mean()) / max(float(heights.std()), 1e-9)
-        # Light from above, and darkness near the ground, occur without a main light.
+        # Light from above and darkness near the ground occur even without a main light.
         causes = np.column_stack([_indicators(groups), normals @ up, heights])
         return cls(normals, values, groups, Regression.of(values, causes))
 
     def judge(self, direction: np.ndarray) -> float:
-        """Return the evidence of a light in ``direction`` (3,); zero if the surfaces that it lights are darker."""
+        """Return the evidence for a light in ``direction`` (3,); zero if the surfaces that it would light are
+        darker."""
         if self.regression is None:
             return 0.0
         evidence, coefficient = self.regression.judge(np.clip(self.normals @ direction, 0.0, None))
@@ -223,7 +226,7 @@ class ShadingEvidence:
 
 
 def displayed(cloud: GaussianCloud) -> np.ndarray:
-    """Return the displayed colours (n, 3), the mean over all directions, not below a minimum."""
+    """Return the displayed colours (n, 3), averaged over all directions and raised to a minimum."""
     return np.clip(0.5 + SH_BAND_0 * cloud.sh.numpy()[:, 0].astype(np.float64), _MIN_COLOUR, 1.0)
 
 
@@ -248,7 +251,7 @@ def _indicators(groups: np.ndarray) -> np.ndarray:
 
 
 def _thinned(cloud: GaussianCloud, count: int) -> GaussianCloud:
-    """Return every k-th opaque Gaussian, at most ``count``, which are wider by the square root of k."""
+    """Return every k-th opaque Gaussian, at most ``count`` in all, enlarged by the square root of k."""
     chosen = np.flatnonzero(cloud.opacities() > _SOLID)
     every = max(1, -(-len(chosen) // count))
     if len(chosen) == 0:

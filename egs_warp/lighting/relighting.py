@@ -15,10 +15,10 @@ from egs_warp.lighting.surface_normals import surface_normals
 
 
 class Relighter:
-    """Relights one cloud in each pose; each call writes into the same array."""
+    """Relights one cloud in successive poses; each call writes into the same array."""
 
     def __init__(self, rest: GaussianCloud, light: MainLight) -> None:
-        """Compute the normals of the cloud ``rest``; the ``light`` is in its axes."""
+        """Compute the normals of the cloud ``rest``. The ``light`` is in the axes of that cloud."""
         self._form = wp.mat44(*np.float32(light.irradiance / mean_irradiance(light)).ravel().tolist())
         self._normals = wp.array(surface_normals(rest).astype(np.float32), dtype=wp.vec3, device=rest.device)
         self._sh = wp.empty_like(rest.sh)

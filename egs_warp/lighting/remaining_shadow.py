@@ -1,4 +1,4 @@
-"""Removal of the shadow that the object cast on the captured ground, which must not stay when the creature moves."""
+"""Removal of the object's shadow from the captured ground, where it must not remain when the creature moves."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.lighting.evidence import GroundEvidence
 
 _LIT = 0.05
-"""Shadow up to which a cell of the ground counts as lit."""
+"""Maximum shadow, 0 to 1, on a lit cell of the ground."""
 _MIN_LIT = 40
-"""Smallest number of lit cells from which the brightness of the others is predicted."""
+"""Minimum number of lit cells from which the brightness of the others is predicted."""
 _SMOOTH = 12
-"""Neighbouring cells whose darkness is averaged: the texture of the ground stays as captured."""
+"""Number of neighbouring cells over which darkness is averaged, so that the texture of the ground is preserved."""
 _MARGIN = 1.5
-"""Height of Gaussians that are lightened, relative to that of the ground's cells."""
+"""Maximum height of Gaussians that are lightened, relative to the maximum height of Gaussians in the ground's cells."""
 
 
 def without_shadow(
     background: GaussianCloud, object_cloud: GaussianCloud, ground: Plane | HeightField, light: MainLight
 ) -> GaussianCloud:
-    """Return ``background`` with the ground lightened where it is darker than the lit ground around it predicts.
+    """Return ``background`` with the ground lightened where it is darker than predicted from the lit ground around it.
 
-    No place is lightened by more than the shadow of ``light`` darkens it, so that the shadow of the object at rest
-    restores the captured brightness. A part that was filled without shadow stays as it is.
+    No place is lightened by more than the shadow of ``light`` darkens it, so that drawing the shadow of the object at
+    rest restores the captured brightness. Ground that was inpainted without shadow is not changed.
 
     Args:
         background: the capture without the object.

@@ -8,20 +8,22 @@ from scipy.spatial import KDTree
 from egs_warp.geometry.gaussians import GaussianCloud
 
 _SOLID = 0.3
-"""Opacity from which a Gaussian counts as part of the surface."""
+"""Minimum opacity of a Gaussian that is part of the surface."""
 _MAX_POINTS = 12_000
-"""Points from which normals are computed; the other Gaussians use the nearest of them."""
+"""Maximum number of points at which normals are computed; the other Gaussians use the nearest point."""
 _NEAR, _FAR = 40, 320
-"""Neighbours that span a piece of the surface, and that lie behind it: seen from outside, their mean is inside."""
+"""Number of neighbours that span a patch of the surface, and of those whose mean lies inside the object."""
 _MIN_AGREEMENT = 0.6
-"""Length of the mean of neighbouring unit normals below which they give no surface, as in fur or at a thin edge."""
+"""Minimum length of the mean of neighbouring unit normals; it is shorter where there is no smooth surface, as in fur or
+at a thin edge."""
 
 
 def surface_normals(cloud: GaussianCloud) -> np.ndarray:
-    """Return the outward unit normals (n, 3) float64 of the surface that the Gaussians form, zero where there is none.
+    """Return the outward unit normals (n, 3) float64 of the surface that the Gaussians form, zero where there is no
+    surface.
 
-    A normal is the direction in which the nearest opaque Gaussians spread the least. Single Gaussians of a capture are
-    too noisy for this: their shortest axes deviate from the surface's normal by tens of degrees.
+    A normal is the direction in which the nearest opaque Gaussians have the least variance. The axes of single
+    Gaussians are too noisy: in a capture, their shortest axes deviate from the surface's normal by tens of degrees.
     """
     means = cloud.means.numpy().astype(np.float64)
     chosen = np.flatnonzero(cloud.opacities() > _SOLID)
@@ -36,7 +38,7 @@ def surface_normals(cloud: GaussianCloud) -> np.ndarray:
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", piece, piece))[1][:, :, 0]
     outward = points - points[near].mean(axis=1)
     normals *= np.where(np.einsum("ni,ni->n", normals, outward) < 0.0, -1.0, 1.0)[:, None]
-    # A mean over the same neighbours removes normals of the wrong sign.
+    # Averaging over the same neighbours corrects normals of the wrong sign.
     normals = normals[near[:, :_NEAR]].mean(axis=1)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(lengths > _MIN_AGREEMENT, normals / np.maximum(lengths, _MIN_AGREEMENT), 0.0)

@@ -29,9 +29,9 @@ class TorchImage:
     """Differentiable image; the tensors share memory with the renderer's arrays."""
 
     colour: torch.Tensor
-    """(H, W, 3) float32."""
+    """(H, W, 3) float32, colour over the background."""
     alpha: torch.Tensor
-    """(H, W) float32."""
+    """(H, W) float32, one minus the transmittance."""
     depth: torch.Tensor
     """(H, W) float32, expected z-depth divided by alpha."""
     slot_end: wp.array
@@ -108,7 +108,7 @@ def _check_tensors(*attributes: torch.Tensor) -> None:
 
 @dataclass
 class _Task:
-    """Arguments of ``_Render`` other than tensors, and ``slot_end``, a further output."""
+    """Non-tensor arguments of ``_Render``, and its additional output ``slot_end``."""
 
     camera: Camera
     background: Any
@@ -192,7 +192,7 @@ def _draw(
         with translate_out_of_memory(cloud, camera):
             projected = project(cloud, view, antialiased=task.antialiased, threads=threads)
             shape = (camera.height, camera.width)
-            # Allocated by torch, because converting a Warp array to a tensor takes as long as three launches.
+            # Allocate with torch, because converting a Warp array to a tensor takes as long as three launches.
             picture = (
                 torch.empty((*shape, 3), dtype=torch.float32, device=device),
                 torch.empty(shape, dtype=torch.float32, device=device),

@@ -21,12 +21,12 @@ from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.render.shadow import ContactShadow
 
 STUDIO_FILE = Path(__file__).with_name("studio.json")
-"""Look of the plain floor and its sky, which films and the page (``web/client/src/ground.ts``) share.
+"""Settings of the plain floor and its sky, which films and the page (``web/client/src/ground.ts``) share.
 
-Colours of the floor near the camera, of the horizon, of the sky and of the grid's lines, sRGB; ``clear`` and ``hazy``:
-depths at which the haze over the floor begins and is complete, relative to that of the floor in the middle of the
-picture; ``min_slope``: smallest downward slope of the view from which that depth is computed; ``sky_rise``: sine of the
-angle above the horizon at which the sky has its own colour.
+The file holds the sRGB colours of the floor near the camera, of the horizon, of the sky and of the grid's lines.
+``clear`` and ``hazy`` are the depths at which the haze over the floor begins and is complete, relative to the depth of
+the floor at the centre of the picture. ``min_slope`` is the smallest downward slope of the view from which that depth
+is computed. ``sky_rise`` is the sine of the angle above the horizon at which the sky reaches its full colour.
 """
 _MAX_BUMP_HEIGHT = 0.06
 """Height over the plane, relative to the shadow's reach, at which a surface receives the shadow at half strength. Below
@@ -43,7 +43,7 @@ class Backdrop:
     """(H W,) vec3, background colour without the shadow."""
     shadow: ContactShadow
     strengths: list[wp.array] | None
-    """(H W,) float32 each, strength of every shadow of ``shadow`` at each pixel; None without shadow."""
+    """(H W,) float32 each, strength of each shadow of ``shadow`` at every pixel; None without shadow."""
     floor_depth: wp.array | None = None
     """(H W,) float32, z-depth of an opaque floor that hides what is below it, 0 where there is none; None if there is
     no such floor."""
@@ -68,7 +68,7 @@ class Backdrop:
 
 
 def studio_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> Backdrop:
-    """Return a pale floor with a grid, which turns into a sky without an edge.
+    """Return a pale floor with a grid; it turns into a sky gradually, without a horizon line.
 
     Args:
         ground: the ground and its shadow.
@@ -99,7 +99,8 @@ def studio_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> 
 
 
 def plain_colour(ground: ContactShadow, colour: tuple[float, float, float], *, shadow: bool = True) -> Backdrop:
-    """Return a backdrop of one colour with only the shadow. Its ``shadow_opacity`` can be laid over another image."""
+    """Return a backdrop of one colour with only the shadow. Its ``shadow_opacity`` can be composited over another
+    image."""
     colour_without_shadow = wp.full(len(ground.depth), wp.vec3(*colour), dtype=wp.vec3, device=ground.device)
     return Backdrop(colour_without_shadow, ground, ground.strengths() if shadow else None, ground.depth)
 
@@ -149,7 +150,8 @@ def captured_scene(
     lift = ground.surface_height.numpy().reshape(shape) / (_MAX_BUMP_HEIGHT * reach)
     on_plane = np.clip(1.5 - np.where(lift > 0.0, lift, -0.5 * lift), 0.0, 1.0)
     on_plane *= ground.depth.numpy().reshape(shape) > 0.0
-    # Floating specks in front of the floor would appear bright in the shadow, and hard edges look cut out.
+    # Smooth the mask: specks that float in front of the floor would remain bright in the shadow, and hard edges would
+    # show.
     kernel = 2 * (max(camera.width, camera.height) // 40) + 1
     on_plane = np.asarray(cv2.medianBlur(np.rint(255.0 * on_plane).astype(np.uint8), kernel), np.float32) / 255.0
     on_plane = cv2.GaussianBlur(on_plane, (0, 0), _EDGE_BLUR_FRACTION * kernel)

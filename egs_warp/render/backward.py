@@ -1,4 +1,4 @@
-"""Backward pass of the renderer: from gradients of the pixels to those of the Gaussians and the camera pose."""
+"""Backward pass of the renderer: gradients with respect to the Gaussians and the camera pose, from pixel gradients."""
 
 from __future__ import annotations
 
@@ -23,22 +23,23 @@ class CloudGradients:
     """Gradient of a scalar loss with respect to all inputs of the image."""
 
     means: wp.array
-    """(n,) vec3."""
+    """(n,) vec3, with respect to the means."""
     rotations: wp.array
     """(n,) vec4, with respect to the stored quaternion; orthogonal to it, because its length has no effect."""
     log_scales: wp.array
-    """(n,) vec3."""
+    """(n,) vec3, with respect to the log scales."""
     opacity_logits: wp.array
-    """(n,) float32."""
+    """(n,) float32, with respect to the opacity logits."""
     sh: wp.array
-    """(n, K) vec3."""
+    """(n, K) vec3, with respect to the SH coefficients."""
     screen: wp.array | None
     """(n,) vec2, with respect to the screen position in pixels; None if not requested."""
     pose_rotation: wp.array | None
-    """(n,) mat33, each Gaussian's part of the gradient with respect to the camera's rotation matrix; None if not
-    requested."""
+    """(n,) mat33, contribution of each Gaussian to the gradient with respect to the camera's rotation matrix; None if
+    not requested."""
     pose_translation: wp.array | None
-    """(n,) vec3, likewise for the translation."""
+    """(n,) vec3, contribution of each Gaussian to the gradient with respect to the camera's translation; None if not
+    requested."""
 
 
 def backward(
@@ -62,7 +63,8 @@ def backward(
     Args:
         cloud, view, projected, lists, image: inputs and results of the forward pass.
         colour_gradient: (H, W) vec3, gradient with respect to ``image``'s colour; None for zero.
-        alpha_gradient, depth_gradient: (H, W) float32, likewise.
+        alpha_gradient, depth_gradient: (H, W) float32, gradients with respect to ``image``'s alpha and depth; None for
+            zero.
         antialiased: as in the forward pass.
         want_pose: also compute the gradient with respect to the camera pose.
         want_screen: also compute the gradient with respect to the screen positions.

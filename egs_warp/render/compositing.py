@@ -1,4 +1,4 @@
-"""Compositing: tile lists to pixels."""
+"""Compositing of the tile lists into pixels."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Background:
     flat: wp.vec3
     """Uniform colour, used if there is no image."""
     image: wp.array | None = None
-    """(H * W,) vec3."""
+    """(H * W,) vec3, colour of each pixel; None for the uniform colour."""
 
 
 @dataclass(frozen=True)

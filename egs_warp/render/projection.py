@@ -22,12 +22,12 @@ from egs_warp.launching import device_of, empty, empty_pooled, launch_rows
 
 @dataclass(frozen=True)
 class ProjectedGaussians:
-    """Screen ellipses of all Gaussians; entries of Gaussians that reach no tile are undefined."""
+    """Screen-space ellipses of all Gaussians; the entries of Gaussians that reach no tile are undefined."""
 
     ellipse: wp.array
     """(n,) vec4: centre x, y in pixels, then a and shear of -ln(alpha / opacity) = a (dx + shear dy)^2 + v dy^2."""
     falloff: wp.array
-    """(n,) vec2: v, ln(opacity)."""
+    """(n,) vec2: coefficient v and ln(opacity) of the same equation."""
     colour_depth: wp.array
     """(n,) vec4: red, green, blue (display-referred, at least 0) and z-depth."""
     slot_end: wp.array
@@ -110,8 +110,8 @@ def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int)
 
 
 class _ReadBack:
-    """One number in page-locked memory, to which a GPU copies twice as fast, and an event that marks the end of the
-    copy."""
+    """One number in page-locked memory, to which a GPU copies twice as fast as to pageable memory, and an event that
+    marks the end of the copy."""
 
     def __init__(self, device: wp.Device) -> None:
         self.array = empty(1, wp.int64, "cpu", pinned=True)
@@ -120,7 +120,7 @@ class _ReadBack:
 
 
 class _ReadBacks(threading.local):
-    """Unused read-backs of this thread, by device."""
+    """Unused read-back buffers of this thread, by device."""
 
     def __init__(self) -> None:
         self.unused: defaultdict[str, list[_ReadBack]] = defaultdict(list)
@@ -150,7 +150,8 @@ def _fetch_last(values: wp.array) -> Callable[[], int]:
 
 
 def _too_many(cloud: GaussianCloud, view: Any, slot_end: np.ndarray) -> UserError:
-    """Return the error for too many tiles: a Gaussian that is not finite, or Gaussians that are too large."""
+    """Return the error for too many tiles, caused by a Gaussian that is not finite or by Gaussians that are too
+    large."""
     bad = np.flatnonzero(np.diff(slot_end, prepend=0) >= int(NOT_FINITE))
     if len(bad) == 0:
         return UserError(

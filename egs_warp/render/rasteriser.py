@@ -121,12 +121,12 @@ def translate_out_of_memory(cloud: GaussianCloud, camera: Camera) -> Iterator[No
         yield
     except (RuntimeError, MemoryError) as error:
         device = cloud.device
-        # A failure to allocate Warp's own scratch memory has many messages.
+        # When Warp cannot allocate its own scratch memory, it raises errors with many different messages.
         full = device.is_cuda and device.free_memory < 0.05 * device.total_memory
         if isinstance(error, RuntimeError) and not (full or re.search("alloc|out of mem", str(error), re.IGNORECASE)):
             raise
         if device.is_cuda:
-            # The error stays in CUDA's state, where Warp's next scan would report it as its own.
+            # The error persists in CUDA's state, and Warp's next scan would report it again.
             with suppress(RuntimeError):
                 dummy = wp.zeros(1, dtype=wp.int32, device=device)
                 wp.utils.array_scan(dummy, dummy)

@@ -19,13 +19,13 @@ from egs_warp.render.projection import view_from_camera
 _LAYERS = ((0.0, 0.1, 0.035), (0.1, 0.35, 0.08), (0.35, 2.0, 0.16))
 """Height range over the plane and blur width of each layer, relative to the body height."""
 _CAST_EDGES = (0.0, 0.2, 0.6, 6.0)
-"""Heights over the plane, relative to the body height, between the layers of the shadow of the main light."""
+"""Bounds between the layers of the main light's shadow: heights over the plane, relative to the body height."""
 _CAST_HEIGHTS = (0.1, 0.4, 1.0)
-"""Height of each of these layers from which the width of its penumbra is computed, relative to the body height."""
+"""Height of each layer from which the width of its penumbra is computed, relative to the body height."""
 _PENUMBRA = 0.5
-"""Standard deviation of a penumbra, relative to half its width: that of a uniform disc."""
+"""Standard deviation of a penumbra, relative to half its width; 0.5 is the value for a uniform disc."""
 _MIN_SINE = 0.17
-"""Smallest sine of the light's elevation that is used: 10 degrees."""
+"""Minimum sine of the light's elevation in the computation, about 10 degrees."""
 _MIN_BLUR = 0.6
 """Smallest standard deviation of a blur, texels."""
 _BLUR_REACH = 4.0
@@ -40,11 +40,11 @@ def shadow_blur_radius(body: GaussianCloud) -> float:
 
 
 class ShadowMap:
-    """Shadow of a body on the disc of a plane, from straight above or from the main light.
+    """Shadow of a body on a disc of the plane, cast straight down or by the main light.
 
-    Straight down, the shadow of a Gaussian depends on its opacity and on the area of its broad side; shadows of higher
-    Gaussians are wider and paler. The shadow of the main light is displaced along the light, and is blurred by the
-    width of its penumbra only.
+    In the shadow cast straight down, the contribution of a Gaussian depends on its opacity and on the area of its broad
+    side, and the shadows of higher Gaussians are wider and paler. The shadow of the main light is displaced along the
+    light, and its only blur is the penumbra.
     """
 
     def __init__(
@@ -136,8 +136,8 @@ class ShadowMap:
 class ContactShadow:
     """The ground as one camera sees it, and the shadow of a body on it.
 
-    Without a main light the shadow is cast straight down. With one, this shadow is paler, and that of the light is
-    added. Arrays are on ``device``, in row-major order of the pixels.
+    Without a main light, the body casts one shadow straight down. With a main light, that shadow is paler, and the
+    shadow of the light is added. Arrays are on ``device``, in row-major order of the pixels.
     """
 
     def __init__(
@@ -183,7 +183,8 @@ class ContactShadow:
         maps = [ShadowMap(plane, centre=centre, reach=reach, **body)]
         opacities = [1.0]
         if light is not None and light.shade > 0.0:
-            # Seen from the disc's centre the light's map is displaced by half a shadow, and larger by as much.
+            # Relative to the disc's centre, the light's map is displaced by half of the shadow's displacement at body
+            # height, and its radius is larger by the same length.
             half = 0.5 * height * _slope(plane, light)
             moved = centre - np.stack(plane.tangents(), axis=1) @ half
             maps.append(ShadowMap(plane, centre=moved, reach=reach + float(np.linalg.norm(half)), light=light, **body))
@@ -196,8 +197,8 @@ class ContactShadow:
             outputs = [empty(len(output), output.dtype, device) for output in outputs]
 
     def strengths(self, surface: np.ndarray | None = None) -> list[wp.array]:
-        """Return the strength (H W,) float32 of each shadow; ``surface`` (H, W) is the fraction of a pixel that
-        receives shadow, None if that is the plane."""
+        """Return the strength (H W,) float32 of each shadow. ``surface`` (H, W) is the fraction of a pixel that
+        receives shadow; None if the plane receives it."""
         received = np.ones(len(self.depth), np.float32) if surface is None else surface.ravel().astype(np.float32)
         return [
             wp.array(np.float32(one.opacity) * received * one.fade.numpy(), dtype=wp.float32, device=self.device)
@@ -259,7 +260,7 @@ def _taps(widths: np.ndarray, device: wp.Device) -> list[wp.array]:
 
 
 def _slope(plane: Plane, light: MainLight | None) -> np.ndarray:
-    """Return the displacement (2,) along the plane's tangents, towards the light, per height over the plane."""
+    """Return the displacement (2,), along the plane's tangents towards the light, per unit of height over the plane."""
     if light is None:
         return np.zeros(2)
     sine = max(float(light.direction @ plane.normal), _MIN_SINE)

@@ -32,24 +32,24 @@ class TileLists:
     gaussian_from_intersection: wp.array
     """(at least tile_start[-1],) int32, nearest first within a tile; equal depths in index order."""
     slot_from_intersection: wp.array
-    """(at least tile_start[-1],) int32, slot of the same pair: its number when pairs are numbered Gaussian by
-    Gaussian."""
+    """(at least tile_start[-1],) int32, slot of each intersection, which is its index in the numbering of all
+    (Gaussian, tile) pairs by Gaussian."""
     tile_work: np.ndarray | None
-    """(tiles,) number of intersections, on a CPU, to distribute the tiles over threads."""
+    """(tiles,) number of intersections, used on a CPU to distribute the tiles over threads."""
     tile_mask: wp.array | None = None
     """(tiles,) int32, 0 for tiles that show the background alone; None renders all."""
 
     @property
     def tile_count(self) -> int:
-        """Number of tiles."""
+        """Number of tiles of the image."""
         return self.tile_start.shape[0] - 1
 
 
 def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int, guess: bool = False) -> TileLists:
     """Sort the visible Gaussians by depth and list them for every tile that they reach (exact ellipse-tile test).
 
-    With ``guess``, the host does not wait for the number of pairs if recent images had few; ``lists_fit`` then returns
-    whether the guessed capacity was large enough.
+    With ``guess``, the host does not block for the number of pairs if recent images had few pairs; ``lists_fit`` then
+    returns whether the guessed capacity was large enough.
     """
     columns = -(-view.width // TILE_SIDE)
     rows = -(-view.height // TILE_SIDE)
@@ -67,7 +67,7 @@ def lists_fit(lists: TileLists, projected: ProjectedGaussians) -> bool:
 
 
 def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, threads: int) -> TileLists:
-    """Build the lists by a counting sort in chunks of the depth order, in parallel and without comparing pairs."""
+    """Build the lists by a counting sort over chunks of the depth order, in parallel and without comparing pairs."""
     device = device_of(projected.ellipse)
     pairs = projected.slot_count
     slot_counts = np.diff(projected.slot_end.numpy(), prepend=0)
@@ -100,7 +100,7 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
     )
     work = counts.numpy().sum(axis=0)
     tile_start = np.concatenate([[0], np.cumsum(work)]).astype(np.int32)
-    # Each chunk's part of a tile follows those of the chunks before it, which are nearer.
+    # In each tile, the entries of a chunk follow the entries of the previous chunks, which are nearer.
     cursor = counts.numpy()
     cursor[:] = np.cumsum(cursor, axis=0) - cursor + tile_start[:-1]
     launch_rows(fill_tiles_kernel, chunks, inputs=[*shared, tile_from_slot], outputs=[counts, gaussians, slots], **walk)
@@ -108,8 +108,8 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
 
 
 def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, guess: bool = False) -> TileLists:
-    """Build the lists by a radix sort of all (tile, Gaussian) pairs by tile and the leading bits of depth; 32-bit keys
-    sort twice as fast as 64-bit keys."""
+    """Build the lists by a radix sort of all (tile, Gaussian) pairs. The 32-bit keys are the tile and the leading bits
+    of depth; they sort twice as fast as 64-bit keys."""
     device = device_of(projected.ellipse)
     count = projected.slot_end.shape[0]
     # Allocate for the expected number of pairs while the GPU projects, before the number is known.
@@ -157,7 +157,7 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, g
 
 
 _MAX_GUESSED_PAIRS = 2_000_000
-"""Expected number of pairs up to which sorting unused capacity takes less time than waiting for their number."""
+"""Maximum number of expected pairs at which sorting unused capacity is faster than waiting for the actual number."""
 
 
 def _update_guess(device: wp.Device, pairs: int) -> None:
@@ -186,7 +186,7 @@ def _lists_for(pairs: int, tiles: int, device: wp.Device) -> _PairBuffers | None
     if pairs == 0:
         return None
     pairs = grow_capacity(pairs)
-    # Two allocations, so that the scratch is released first.
+    # Use two allocations, so that the scratch space can be released before the lists.
     return _PairBuffers(
         *empty_pooled(device, (2 * pairs, wp.uint32), (3 * pairs, wp.int32)),
         *empty_pooled(device, (tiles + 1, wp.int32), (pairs, wp.int32), (pairs, wp.int32)),

@@ -17,28 +17,29 @@ from egs_warp.segmentation.connectivity import enclosed
 from egs_warp.segmentation.plane_search import lies_along
 
 CELLS = 64
-"""Number of cells across the object, for connectivity."""
+"""Number of grid cells across the object in the connectivity test."""
 _MIN_OPACITY = 0.1
 """Minimum opacity of Gaussians that connect others. Fainter ones are assigned with their surroundings."""
 _MIN_DETACHED_HEIGHT = 0.1
 """Fraction of the object's size. A part whose lowest point is higher does not stand on the ground."""
 _GAP = 2.0 / CELLS
-"""Fraction of the object's size. A detached part this near to the object or nearer belongs to it."""
+"""Fraction of the object's size. A detached part at most this far from the object belongs to it."""
 _MAX_CHAIN = 4
 """Maximum number of detached parts in a chain, such as leaves that hang next to other detached leaves."""
 _HEAVY, _LIGHT = 0.05, 0.01
-"""Fractions of the object's opacity mass. A detached part above the first is not a stray; one below the second supports
-nothing."""
+"""Fractions of the object's opacity mass. A detached part heavier than the first is not a stray; a part lighter than
+the second cannot support another."""
 _MAX_DETACHED_GAP, _MIN_GAP_RATIO = 0.2, 2.0
-"""Maximum distance of a detached part, such as a robot's hand, from the object, as a fraction of the object's size; any
-other possible support must be farther than the given multiple of that distance."""
+"""Maximum distance from the object of a heavy detached part, such as a robot's hand, as a fraction of the object's
+size; and the minimum ratio between the part's distance from any other possible support and its distance from the
+object."""
 _NEAR_CLICK = 0.1
 """Fraction of the object's size. A click that hits only faint Gaussians selects the part within this distance."""
 
 
 @dataclass(frozen=True)
 class SceneAbovePlane:
-    """Quantities of the capture that the search uses repeatedly; all (n, ...)."""
+    """Quantities of a capture above its plane that the search for the object uses repeatedly; arrays are (n, ...)."""
 
     cloud: GaussianCloud
     plane: Plane | HeightField
@@ -60,13 +61,14 @@ class SceneAbovePlane:
         return cls(cloud, plane, means, flat, plane.heights(means), opacity, opacity >= _MIN_OPACITY, level)
 
     def is_under(self, chosen: np.ndarray, height: float, size: float) -> np.ndarray:
-        """Return (n,) bool, True for Gaussians within the outline, seen along the normal, of the ``chosen`` (n,) bool
-        ones that are lower than ``height``, for an object of ``size``; both in scene units."""
+        """Return (n,) bool, True for Gaussians under the object's low parts: inside the outline, seen along the normal,
+        of those Gaussians among the ``chosen`` (n,) bool that are lower than ``height``. ``size`` is the size of the
+        object; both are in scene units."""
         return enclosed(self.flat, self.flat[chosen & (self.heights < height)], size / CELLS)
 
     def is_within(self, these: np.ndarray, chosen: np.ndarray, size: float) -> np.ndarray:
-        """Return (m,) bool, True for Gaussians ``these`` (m,) within the shell of the ``chosen`` (n,) bool ones, which
-        the plane closes from below."""
+        """Return (m,) bool, True for the Gaussians ``these`` (m,), indices, inside the shell formed by the ``chosen``
+        (n,) bool Gaussians and closed from below by the plane. ``size`` is the size of the object, scene units."""
         upright = np.column_stack([self.flat, self.heights])
         skin = upright[chosen]
         return enclosed(upright[these], np.concatenate([skin, skin * [1.0, 1.0, 0.0]]), 2.0 * size / CELLS)
@@ -75,8 +77,8 @@ class SceneAbovePlane:
 def detached_parts(
     scene: SceneAbovePlane, indices: np.ndarray, parts: np.ndarray, meant: np.ndarray, size: float
 ) -> np.ndarray:
-    """Return the detached parts that belong to the object: they hang in the air next to the ``meant`` parts and have
-    less mass.
+    """Return the indices of the detached parts that belong to the object. They do not touch the ground, are next to the
+    ``meant`` parts and have less mass.
 
     In a coarse capture, leaves are separated from their twigs, and nothing else supports them. Parts that are not
     strays may be farther away if the object is by far the nearest possible support.
@@ -85,7 +87,7 @@ def detached_parts(
         scene: the capture.
         indices: (m,) Gaussians.
         parts: (m,) connected part of each Gaussian.
-        meant: parts of the object.
+        meant: indices of the parts that are known to belong to the object.
         size: size of the object, scene units.
     """
     heights, mass = scene.heights[indices], np.bincount(parts, weights=scene.opacity[indices])
@@ -115,9 +117,9 @@ def detached_parts(
 
 
 def _gaps(points: np.ndarray, parts: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """Return (k,), the distance of each part in ``these`` (k,) bool from the nearest part in ``those`` (k,) bool;
-    infinite for all other parts, and if ``those`` is empty. ``parts`` (m,) is the part of each of the ``points`` (m,
-    3)."""
+    """Return (k,), the distance of each part selected by ``these`` (k,) bool from the nearest part selected by
+    ``those`` (k,) bool, scene units; infinite for all other parts, and if ``those`` selects none. ``parts`` (m,) is the
+    part of each of the ``points`` (m, 3)."""
     gaps = np.full(len(these), np.inf)
     of, near = np.flatnonzero(these[parts]), np.flatnonzero(those[parts])
     if len(of) and len(near):
@@ -128,8 +130,8 @@ def _gaps(points: np.ndarray, parts: np.ndarray, these: np.ndarray, those: np.nd
 def clicked_parts(
     indices: np.ndarray, parts: np.ndarray, scene: SceneAbovePlane, clicks: Sequence[Click], size: float
 ) -> np.ndarray:
-    """Return the parts that clicks on the object hit or barely miss. ``parts`` (m,) is the part of each of the
-    Gaussians ``indices`` (m,)."""
+    """Return the indices of the parts that clicks on the object hit or barely miss. ``parts`` (m,) is the part of each
+    of the Gaussians ``indices`` (m,); ``size`` is the size of the object, scene units."""
     found = []
     for click in clicks:
         if not click.inside:

@@ -20,11 +20,11 @@ _COLUMNS = 64
 _SEARCHED_SHARE = 0.15
 """Fraction of the height, from the bottom, that is searched for the support."""
 _BANDWIDTH = 0.01
-"""Fraction of the height. Undersides this close belong to one support."""
+"""Fraction of the height: the width of one level. Column bottoms whose heights differ by less belong to one support."""
 _MAX_GAUSSIANS = 300_000
-"""Maximum number of Gaussians, spread evenly, from which the up direction is estimated."""
+"""Maximum number of Gaussians, sampled evenly, from which the up direction is estimated."""
 _MAX_MASS_BELOW = 0.015
-"""Maximum share of the opacity mass below the plane: half of what contact may exclude."""
+"""Maximum share of the opacity mass below the plane: half of the share that contact may exclude."""
 
 
 _AXIS_NAMES = "xyz"
@@ -33,10 +33,11 @@ _AXIS_BONUS = {1: 0.10, 2: 0.05, 0: 0.0}
 then z, hardly ever x."""
 _CLEAR_MARGIN = 0.3
 _POOR_SCORE = 1.75
-"""Score below which no axis fits: that of the side of an object that is tilted."""
+"""Score below which no axis is a good up direction. An object that is tilted scores less than this on each of its
+sides."""
 _SURE_LEVEL = 0.5
-"""Level fraction of the support. A tilted direction replaces an axis if its own fraction is not below this, that of the
-axis is, and its score is clearly higher."""
+"""Minimum level fraction of a reliable support. A tilted direction replaces an axis only if its own level fraction
+reaches this value, the axis's does not, and its score is clearly higher."""
 _FEW_GAUSSIANS, _MAX_DIRECTIONS = 20_000, 24
 """Number of Gaussians used in the search for tilted directions, and maximum number of directions."""
 
@@ -48,16 +49,16 @@ class _Underside:
     heights: np.ndarray
     """(n,) heights of all means along the up direction, scene units."""
     opacities: np.ndarray
-    """(n,) opacities."""
+    """(n,) opacities of the Gaussians, 0 to 1."""
     low: float
     high: float
-    """Robust lowest and highest height."""
+    """Robust highest height, scene units; ``low`` is the robust lowest one."""
     bottoms: np.ndarray
     """(c,) lowest visible height of each column."""
     columns: np.ndarray
     """(c, 2) integer position of each column."""
     column_width: float
-    """Scene units."""
+    """Width of a column, scene units."""
     centre: np.ndarray
     """(2,) centre of opacity, in columns."""
 
@@ -140,7 +141,8 @@ def _support_level(underside: _Underside) -> float:
 
 
 def _mass_quantile(values: np.ndarray, masses: np.ndarray, share: float) -> float:
-    """Return the value below which at most ``share`` of the mass lies."""
+    """Return the element of ``values`` (n,) at which the cumulative sum of ``masses`` (n,) reaches the fraction
+    ``share`` of the total."""
     order = np.argsort(values, kind="stable")
     mass = np.cumsum(masses[order])
     return float(values[order][min(int(np.searchsorted(mass, share * mass[-1])), len(values) - 1)])
@@ -153,9 +155,9 @@ def guess_up(
     tilted: bool = True,
     vertical_axis: int | None = None,
 ) -> tuple[np.ndarray, str]:
-    """Return the up direction (3,), a unit vector, and the reason for this choice, for the user.
+    """Return the up direction (3,), a unit vector, and the reason for this choice, as text for the user.
 
-    The direction is ``capture_format_up`` if the file defines it, otherwise the best of the six axes or, with
+    The direction is ``capture_format_up`` if the file defines it. Otherwise it is the best of the six axes or, with
     ``tilted``, another direction in which the object clearly rests better. If the ``vertical_axis`` (0 to 2) is known,
     it is the positive direction of that axis, unless the negative one is clearly better.
 
@@ -219,7 +221,7 @@ class _Support:
     """Quality of the support on one side; each value is 0 to 1."""
 
     polygon: float
-    """Area of the support polygon divided by that of the silhouette."""
+    """Area of the support polygon divided by the area of the silhouette."""
     level: float
     """Fraction of the low columns that end at the support's level."""
     depth: float
@@ -228,7 +230,7 @@ class _Support:
 
     @property
     def score(self) -> float:
-        """Sum of the three, 0 to 3."""
+        """Sum of the three qualities, 0 to 3."""
         return self.polygon + self.level + self.depth
 
     def __str__(self) -> str:

@@ -42,7 +42,8 @@ class ExtentMeasure(enum.Enum):
     AXIS_TIPS = "axis-tips"
     """The farthest of its six axis tips, Eq. (20)."""
     ELLIPSOID = "ellipsoid"
-    """Its whole ellipsoid, gamma sqrt(N^T Sigma N): up to sqrt 3 times as far."""
+    """The extent of its ellipsoid along the normal, gamma sqrt(N^T Sigma N), which is up to sqrt 3 times the extent of
+    the tips."""
 
 
 class StraddlingPolicy(enum.Enum):
@@ -61,22 +62,22 @@ class StraddlingPolicy(enum.Enum):
 
 @dataclass(frozen=True)
 class StraddlingOptions:
-    """Options of the fine-tune."""
+    """Options of ``StraddlingPolicy.FINETUNE``."""
 
     iterations: int = 100
     reach: ExtentMeasure = ExtentMeasure.ELLIPSOID
     weight: float = 0.3
     """Weight of L_seg relative to the photometric loss; results for 0.3 and 3 agree to 0.4 dB."""
     subdivisions: int = 5
-    """Maximum number of times that straddling Gaussians are first split in three across the plane: smaller ones come
-    closer to it without crossing. 0 is the paper's method."""
+    """Maximum number of rounds, before training, in which each straddling Gaussian is split in three across the plane.
+    Smaller Gaussians can lie closer to the plane without crossing it. The paper's method is 0."""
     fine_reach: float = 0.006
     """Fraction of the object's height. Gaussians that extend no farther across the plane are not split further."""
     max_growth: float = 0.25
-    """Maximum number of Gaussians that the splitting adds, as a fraction of the object's. Those that extend farthest
-    across the plane are split first. Without this bound, each round doubles the number of straddling Gaussians."""
+    """Maximum number of Gaussians that these splits add, as a fraction of the object's. Gaussians that extend farthest
+    across the plane are split first. Without this limit, each round doubles the number of straddling Gaussians."""
     cut_rest: bool = True
-    """Cut Gaussians that still straddle after training at the plane, as ``SPLIT`` does; the paper leaves them."""
+    """Cut Gaussians that still straddle after training at the plane, as ``SPLIT`` does; the paper does not cut them."""
     seed: int = 0
 
 
@@ -162,8 +163,9 @@ def clear_plane(
 def half_space(cloud: GaussianCloud, plane: Plane, chosen: np.ndarray) -> GaussianCloud:
     """Return ``cloud`` with each of the ``chosen`` (n,) bool Gaussians replaced by its part above the plane.
 
-    Mass, mean and covariance are those of a normal distribution truncated at the plane: with t = -d0 / sigma and l =
-    pdf(t) / (1 - cdf(t)), mean m + l Sigma N / sigma, covariance Sigma - l (l - t) Sigma N N^T Sigma / sigma^2.
+    Mass, mean and covariance follow from truncating a normal distribution at the plane. With t = -d0 / sigma and l =
+    pdf(t) / (1 - cdf(t)), the mean is m + l Sigma N / sigma, and the covariance is Sigma - l (l - t) Sigma N N^T Sigma
+    / sigma^2.
     """
     source = np.flatnonzero(chosen).astype(np.int32)
     device = cloud.device
@@ -193,7 +195,8 @@ def half_space(cloud: GaussianCloud, plane: Plane, chosen: np.ndarray) -> Gaussi
 
 
 def views_above(cloud: GaussianCloud, plane: Plane, cameras: Sequence[Camera]) -> list[TrainingView]:
-    """Render ``cloud`` alone. Pixels count only if they show something above the plane, or nothing at all."""
+    """Render ``cloud`` alone. The valid pixels are those that show something above the plane and those that show
+    nothing."""
     from egs_warp.training.finetune import TrainingView
 
     views = []
@@ -222,9 +225,9 @@ def foot_ring(cloud: GaussianCloud, plane: Plane, *, size: int = 256) -> list[Ca
 def _subdivided(
     cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure, fine_reach: float, max_count: int
 ) -> GaussianCloud:
-    """Split straddling Gaussians that extend farther than ``fine_reach`` (scene units) in three, along the axis that
-    extends farthest across the plane; those that extend farthest come first, up to ``max_count`` Gaussians in all.
-    Children with means below the plane are removed."""
+    """Split in three the straddling Gaussians that extend across the plane by more than ``fine_reach`` (scene units),
+    along the axis that extends farthest. Those that extend farthest are split first, until there are ``max_count``
+    Gaussians. Children with means below the plane are removed."""
     offsets, shrink = child_layout(SplitRule.MEASURED)
     heights, extent = plane_extents(cloud, plane, reach)
     parents = np.flatnonzero((np.abs(heights) < extent) & (extent > fine_reach))
@@ -286,7 +289,7 @@ def _finetuned(
         return cloud
     whole = cloud if surroundings is None else concatenate(cloud, surroundings)
     scale = float(np.median(reach[straddling]))
-    # Gaussians just above the plane take over the appearance of the straddling ones.
+    # Gaussians just above the plane are trained, too: they take over the appearance of the straddling ones.
     free = np.zeros(whole.count, bool)
     free[: cloud.count] = heights < 3.0 * scale
     views = _cropped(views, cloud.subset(free[: cloud.count]))
@@ -300,8 +303,8 @@ def _finetuned(
         loss = straddling_loss(tensors, near, normal, plane.offset, options.reach)
         return options.weight / (scale * int(straddling.sum())) * loss
 
-    # Pictures with transparency are composited over random colours, so that nothing can hide in front of a background
-    # of its own colour.
+    # Composite pictures with transparency over random colours, so that no Gaussian is hidden by a background of its own
+    # colour.
     cut_out = all(view.alpha is not None for view in views)
     result = finetune(
         trained,
@@ -321,8 +324,8 @@ def _finetuned(
 
 
 def _cropped(views: Sequence[TrainingView], foot: GaussianCloud) -> list[TrainingView]:
-    """Crop ``views`` to the Gaussians ``foot``, and leave out views that do not show them; all of ``views`` if none
-    does."""
+    """Crop ``views`` to the Gaussians ``foot`` and omit views that do not show them. Return ``views`` unchanged if none
+    shows them."""
     means, radii = foot.means.numpy().astype(np.float64), GAMMA * np.exp(foot.log_scales.numpy().max(axis=1))
     crops = []
     for view in views:
@@ -359,16 +362,16 @@ def _in_pictures(cloud: GaussianCloud, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def straddling_loss(tensors: GaussianTensors, near: Any, normal: Any, offset: float, reach: ExtentMeasure) -> Any:
-    """L_seg of Eq. (21): the sum of eta_seg - |d0| over the Gaussians of the indices ``near`` (m,) that straddle the
+    """L_seg of Eq. (21): the sum of eta_seg - |d0| over the Gaussians with indices ``near`` (m,) that straddle the
     plane.
 
-    Returns a scalar tensor, scene units; ``normal`` (3,) and ``offset`` are the plane's.
+    The result is a scalar tensor, scene units; ``normal`` (3,) and ``offset`` are the plane's.
     """
     import torch
 
     q = torch.nn.functional.normalize(tensors.rotations[near], dim=1)
     w, v = q[:, :1], q[:, 1:]
-    # N in each Gaussian's own axes, by the conjugate quaternion.
+    # Express N in each Gaussian's own axes: rotate it by the conjugate quaternion.
     n = normal.expand_as(v)
     local_normal = n + 2.0 * torch.cross(-v, torch.cross(-v, n, dim=1) + w * n, dim=1)
     along = local_normal * torch.exp(tensors.log_scales[near])

@@ -15,26 +15,26 @@ from egs_warp.segmentation.graph_cut import SplatGraph
 from egs_warp.segmentation.votes import MaskedView, blending_votes
 
 _RADIUS = 0.004
-"""Fraction of the picture's longer side: radius of a click."""
+"""Radius of a click as a fraction of the picture's longer side."""
 _MIN_WEIGHT_FRACTION = 0.1
 """Fraction of the largest blending weight under a click; Gaussians below it are not hit."""
 _SURFACE_FRACTION = 0.25
 """The clicked surface lies at the depth where the blending weight under the click, summed from the front, reaches this
 fraction."""
 _WIDE, _FAINT = 0.05, 0.5
-"""Width as a fraction of the distance, and opacity. Wider and fainter Gaussians are haze in the air, and a click
-selects what is behind them."""
+"""Minimum width, as a fraction of the distance, and maximum opacity of haze. A click selects what is behind Gaussians
+that are wider and fainter than these."""
 _MAX_DEPTH_DIFFERENCE = 0.03
-"""Fraction of the distance. Gaussians farther than this in front of or behind the clicked surface belong to another
-one."""
+"""Maximum distance of a Gaussian, in front of or behind the clicked surface, as a fraction of the surface's distance
+from the camera. Gaussians farther away belong to another surface."""
 _SURE = 0.5
-"""Absolute score from distances alone above which a Gaussian's colour counts as a colour of its side."""
+"""Absolute score, from distances alone, above which a Gaussian's colour is a sample of the colours of its side."""
 _ALIKE = 8
-"""Number of nearest colours that measure how common a colour is on a side."""
+"""Rank of the nearest colour whose distance measures how common a colour is on a side."""
 _BY_COLOUR = 0.5
-"""Maximum contribution of colours to the score, relative to that of distance."""
+"""Maximum contribution of colours to the score, relative to the contribution of distances."""
 _ISLAND = 0.1
-"""Fraction of the retained part. A part without a click is dropped if it is smaller."""
+"""Fraction of the retained part. A connected part that is smaller and has no click is dropped."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
     """Return the click at pixel (``u``, ``v``), from the top left corner of ``camera``'s picture; None if nothing is
     there.
 
-    Only a window about the click is rendered. The depth of the click is the one at which the blending weight, summed
-    from the front, reaches a quarter of its total, so that a click on foliage selects the leaves and not the wall
-    visible between them. Haze in the air, as in captures from a turntable, is ignored if the other Gaussians have
-    enough weight. The hits are the Gaussians that paint the window at that depth.
+    Only a window about the click is rendered. At the depth of the click, the blending weight, summed from the front,
+    reaches a quarter of its total, so that a click on foliage selects the leaves and not the wall visible between them.
+    Haze in the air, as in captures from a turntable, is ignored if the other Gaussians have enough weight. The hits are
+    the Gaussians that paint the window at that depth.
     """
     reach = max(1, round(_RADIUS * max(camera.width, camera.height)))
     left, top, side = int(u) - reach, int(v) - reach, 2 * reach + 1
@@ -99,9 +99,9 @@ def removed_by_clicks(
 ) -> np.ndarray:
     """(m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that ``clicks`` remove.
 
-    A click beside the object that hits something lower than ``low`` selects something on the ground, such as a shadow:
-    it removes nothing that is higher than both ``low`` and twice the height of what it hits. ``heights`` (m,) are the
-    heights of the nodes above the ground, scene units.
+    If all hits of a click beside the object are lower than ``low``, the click selects something on the ground, such as
+    a shadow. Then it does not remove Gaussians that are higher than ``low`` and higher than twice its highest hit.
+    ``heights`` (m,) are the heights of the nodes above the ground, scene units.
     """
     removed = np.zeros(len(nodes), bool)
     mine = [click for click in clicks if click.inside]
@@ -124,12 +124,12 @@ def removed_by_clicks(
 def cut_by_clicks(
     cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], *, required: np.ndarray | None = None
 ) -> np.ndarray:
-    """(m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that the ``clicks`` leave with the
-    object. ``required`` (m,) bool Gaussians stay unless a click beside the object hits them.
+    """(m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that remain the object's after the
+    ``clicks``. ``required`` (m,) bool Gaussians remain unless a click beside the object hits them.
 
-    The score of each Gaussian prefers the clicks that are nearer along links between neighbours, which are longer the
-    more their colours differ, and the side on which its colour is more common. The labels are the minimum cut. Nothing
-    is cut if no click hits something that does not belong to the object.
+    The score of each Gaussian compares the two kinds of clicks by their distance along links between neighbours, which
+    is longer where colours differ more, and by how common the Gaussian's colour is on each side. The labels are the
+    minimum cut. Nothing is cut unless a click hits something that does not belong to the object.
     """
     hit, out = (hits_among(nodes, clicks, inside=inside) for inside in (True, False))
     # Gaussians hit by both kinds give no information.
@@ -155,8 +155,8 @@ def cut_by_clicks(
 
 
 def _by_colour(cloud: GaussianCloud, nodes: np.ndarray, score: np.ndarray) -> np.ndarray:
-    """(m,) -1 to 1, how much more common a Gaussian's colour is on the object's side than on the other, by the distance
-    to its eighth nearest colour among the clear Gaussians of each side."""
+    """(m,) -1 to 1, how much more common a Gaussian's colour is on the object's side than on the other. The measure is
+    the distance to its eighth nearest colour among the Gaussians of each side whose score is clear."""
     colours = cloud.sh.numpy()[nodes, 0].astype(np.float64) * SH_BAND_0
     away = []
     for side in (score > _SURE, score < -_SURE):

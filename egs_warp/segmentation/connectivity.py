@@ -15,9 +15,9 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.unique_rows import distinct_rows
 
 _ARM = 1.5
-"""Length of a Gaussian's arms in standard deviations; arms are limited to four cells."""
+"""Half-length of a Gaussian along each axis, in standard deviations; limited to four cells."""
 _FOURTH = 4
-"""Index of the neighbour whose distance measures how sparse a capture is."""
+"""Rank of the nearest neighbour whose distance measures how sparse a capture is."""
 _MAX_GAUSSIANS = 200_000
 """Maximum number of Gaussians, spread evenly, from which the sparsity is measured."""
 
@@ -27,7 +27,7 @@ def connected_parts(
 ) -> np.ndarray:
     """(m,) int32 connected part of each of the ``chosen`` (m,) Gaussians.
 
-    Gaussians are connected if their centres or arms lie in the same cell of a grid.
+    Gaussians are connected if points on their axes, the mean included, lie in the same cell of a grid.
 
     Args:
         cloud: the capture.
@@ -38,8 +38,8 @@ def connected_parts(
     """
     points = cloud.means.numpy()[chosen].astype(np.float64)
     if len(points) > _FOURTH:
-        # The nearest neighbour is often at distance zero: training that splits in place leaves many Gaussians at one
-        # point.
+        # The distance of the nearest neighbour is often zero, because training that splits Gaussians in place leaves
+        # many of them at the same point.
         few = points[:: -(-len(points) // _MAX_GAUSSIANS)]
         cell = max(cell, 2.0 * float(np.median(KDTree(points).query(few, k=_FOURTH + 1)[0][:, _FOURTH])))
     lengths = np.minimum(_ARM * np.exp(cloud.log_scales.numpy()[chosen].astype(np.float64)), 4.0 * cell)

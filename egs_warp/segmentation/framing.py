@@ -1,5 +1,5 @@
-"""Background from the framing of photos: photographers keep the object in the picture, and what most photos do not show
-is not part of it."""
+"""Background found from the framing of photos: photographers keep the object in the picture, so Gaussians that few
+photos contain do not belong to it."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from egs_warp.segmentation.clicks import Click
 from egs_warp.segmentation.object_spec import ObjectSpec
 
 _MIN_PHOTOS, _MAX_PHOTOS = 8, 32
-"""Number of photos below which framing says nothing, and number above which they are thinned out evenly."""
+"""Number of photos below which framing gives no information, and number above which photos are sampled evenly."""
 _MAX_SHARE = 0.1
-"""Share of the photos of the object in whose frame a Gaussian may lie and still be background. Shares from 0.1 to 0.5
-give the same object for a bear on a duvet; a small one spares objects that were photographed in parts."""
+"""Maximum share of the photos of the object in whose frame a background Gaussian may lie. Shares from 0.1 to 0.5 give
+the same object for a bear on a duvet; a small share keeps objects that were photographed in parts."""
 _HITS, _SOLID = 8, 0.3
-"""Number of Gaussians next to a point that stand for a click, and their minimum opacity."""
+"""Number of Gaussians next to a point that represent a click there, and their minimum opacity."""
 
 
 def with_framing(cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camera]) -> ObjectSpec:
     """Return ``spec`` with a click beside the object that hits all background known from the framing of the photos.
 
-    The photos of the object are those whose frame contains its point. Nothing is added to a box or to masks, which say
-    more, nor if there are few photos or no such background.
+    The photos of the object are those whose frame contains its point. Nothing is added if there are few photos or no
+    such background, or if ``spec`` has a box or masks, which are more precise.
 
     Args:
         cloud: the capture.

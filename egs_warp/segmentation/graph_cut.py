@@ -19,11 +19,11 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 
 _NEIGHBOURS = 10
 _DETOUR = 6.0
-"""Relative lengthening of a link if the colours of its ends differ by the mean difference of all links."""
+"""Relative lengthening of a link whose ends differ in colour by the mean difference over all links."""
 _UNIT = 1000
 """Scores are multiplied by this number and rounded to integers."""
 _UNCUTTABLE = 1 << 28
-"""Capacity of a link that is never cut; the flow through all such links of a node must fit in 31 bits."""
+"""Capacity of a link that must not be cut; the flow through all such links of a node must fit in 31 bits."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class SplatGraph:
         ends = np.stack([np.repeat(np.arange(count), neighbours), np.ravel(others)]).astype(np.int64)
         # Coincident Gaussians may come before the point itself.
         ends = np.sort(ends[:, ends[0] != ends[1]], axis=0)
-        # One number per pair: sorting rows takes ten times as long.
+        # Encode each pair as one number: sorting rows takes ten times as long.
         first, second = np.divmod(np.unique(ends[0] * count + ends[1]), count)
         first, second = first.astype(np.int32), second.astype(np.int32)
         away, apart = _differences(points, colours, first, second)
@@ -70,7 +70,7 @@ class SplatGraph:
 
         Args:
             cluster: (n,) int, cluster of each Gaussian, from 0.
-            points: (k, 3) middle of each cluster.
+            points: (k, 3) centre of each cluster, scene units.
             colours: (k, 3) mean colour of each cluster, 0 to 1.
         """
         count = len(points)
@@ -103,7 +103,7 @@ class SplatGraph:
     def distances(self, seeds: np.ndarray) -> np.ndarray:
         """(n,) length of the shortest path along the links from each Gaussian to one of the ``seeds`` (k,); infinite if
         there is none."""
-        # Paths of zero length would count as missing links.
+        # Links of zero length would be treated as missing.
         links = coo_array((np.maximum(self.length, 1e-9), (self.first, self.second)), shape=(self.count,) * 2)
         return dijkstra(links.tocsr(), directed=False, indices=seeds, min_only=True)
 
@@ -116,7 +116,7 @@ class SplatGraph:
             score: (n,) cost of excluding a Gaussian, or, if negative, of including it.
             included: (n,) bool, always included.
             excluded: (n,) bool, always excluded.
-            smoothness: factor of the links' strength, the cost of cutting them.
+            smoothness: factor of the links' strength, which is the cost of cutting them.
 
         Returns:
             (n,) bool, True for included Gaussians.

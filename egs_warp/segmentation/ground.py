@@ -1,4 +1,4 @@
-"""Measurement of uneven ground: heights over its plane, fused from the depth of many views."""
+"""Heights of uneven ground over its plane, fused from depth images of many views."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.seen_surface import SeenSurface
 
 ROUGH = 0.01
-"""Fraction of the object's height. Ground that differs from its plane by more than this (standard deviation) is uneven;
-half of it is the penetration that contact allows."""
+"""Fraction of the object's height. Ground is uneven if the standard deviation from its plane exceeds this. Contact
+allows a penetration of half as much."""
 REACH = 2.5
-"""Fraction of the object's size: half the side of the square about its middle in which the ground is measured."""
+"""Half the side of the measured square about the object's centre, as a fraction of the object's size."""
 _SPACING = 0.025
 """Fraction of the object's size: distance between nodes."""
 _BAND = 0.25
@@ -31,7 +31,7 @@ _BAND = 0.25
 _MIN_VIEWS = 3
 """Minimum number of views that must show a node."""
 _MAX_VIEW_DIFFERENCE = 0.02
-"""Fraction of the object's size. Where views differ by more (standard deviation), the node is unknown."""
+"""Fraction of the object's size. A node is unknown if the standard deviation of its height between views is larger."""
 _MIN_SIGNAL_TO_NOISE = 3.0
 """Ground is uneven if it is rougher than this many times the difference between views, because reflections also cause
 bumps."""
@@ -58,14 +58,14 @@ _PATCH = 0.05
 
 @dataclass(frozen=True)
 class MeasuredGround:
-    """The ground about an object."""
+    """Heights of the ground about an object, and their quality."""
 
     field: HeightField
     """Scene units. Unseen ground, including the ground under the object, is the harmonic continuation."""
     known: np.ndarray
     """(rows, columns) bool, nodes that were seen."""
     roughness: float
-    """Standard deviation (robust) from the best plane next to the object, scene units."""
+    """Robust standard deviation of the ground next to the object from its best-fit plane, scene units."""
     noise: float
     """Median, over the nodes next to the object, of the standard deviation between views, scene units."""
 
@@ -76,7 +76,7 @@ class MeasuredGround:
     def touched_by(self, object_cloud: GaussianCloud, size: float) -> HeightField:
         """Return ``field``, raised in unseen places until the object stands on it.
 
-        The top of a fold under an object is unseen, and the harmonic continuation misses it.
+        The top of a fold under an object is unseen, so the harmonic continuation passes below it.
 
         Args:
             object_cloud: Gaussians of the object.
@@ -108,9 +108,9 @@ def measure_ground(
 ) -> MeasuredGround:
     """Measure the heights of the ground next to an object.
 
-    The capture is rendered through ``cameras``, or a ring of cameras. Each node of a grid gets the median height in
-    each view, then the median over the views. Unseen ground, beyond edges and under the object, is the harmonic
-    continuation; at the grid's edge it is the plane.
+    The capture is rendered through ``cameras``, or through a ring of cameras. The height of a grid node is the median
+    over the views of the median height in each view. Unseen ground, beyond edges and under the object, is the harmonic
+    continuation, with the plane as the boundary value at the grid's edge.
 
     Args:
         cloud: the capture.
@@ -164,9 +164,9 @@ def measure_ground(
 
 
 def _seen_points(cloud: GaussianCloud, bare: GaussianCloud, camera: Camera, plane: Plane) -> np.ndarray:
-    """(n, 3) points of ``bare``, the capture without the object, that are also visible in ``cloud``, with it. Other
-    points are seen through the hole that the object leaves, and lie below the ground. The heights of the returned
-    points over ``plane`` are those of the splats (``SeenSurface``)."""
+    """(n, 3) points of the ground that ``camera`` sees both in ``cloud`` and in ``bare``, the capture without the
+    object. Points that appear only in ``bare`` are seen through the hole that the object leaves, and lie below the
+    ground. The heights of the returned points over ``plane`` are computed from the splats (``SeenSurface``)."""
     whole, left = SeenSurface.of(cloud, camera), SeenSurface.of(bare, camera)
     same = np.abs(whole.depth - left.depth) < _DEPTH_TOLERANCE * left.depth
     return left.points(plane, left.opaque & same)
@@ -205,8 +205,8 @@ def _medians(points: np.ndarray, axes: np.ndarray, origin: np.ndarray, spacing: 
 
 
 def _roughness(heights: np.ndarray, around: np.ndarray) -> float:
-    """Standard deviation (robust) of ``heights`` (rows, columns) from their best plane, at the nodes ``around`` (rows,
-    columns) bool."""
+    """Robust standard deviation of ``heights`` (rows, columns) from their best-fit plane, at the nodes ``around``
+    (rows, columns) bool."""
     if around.sum() < 4:
         return 0.0
     rows, columns = np.nonzero(around)

@@ -1,4 +1,5 @@
-"""Interactive segmentation: the Gaussians of an object from clicks, in about a second for a few hundred thousand.
+"""Interactive segmentation: an object's Gaussians from clicks, in about one second for a few hundred thousand
+Gaussians.
 
 A capture is prepared once: clusters of neighbouring Gaussians, and the links between clusters. Each change of the
 clicks then solves a problem of some ten thousand clusters. See docs/concepts/segmentation.md.
@@ -26,33 +27,33 @@ _MIN_OPACITY = 0.1
 _NEIGHBOURS = 6
 """Number of nearest neighbours to which a Gaussian is linked."""
 _SIGMAS, _MAX_GAP = 3.0, 2.0
-"""Half-length of a Gaussian in standard deviations, and the longest gap between two linked Gaussians, in medians of the
-distances between neighbours. Without this limit, a floater in empty space is linked to the object alone, so that no cut
-is cheaper than to include it."""
+"""Half-length of a Gaussian in standard deviations, and the longest gap that a link bridges, as a multiple of the
+median distance between neighbours. Without the limit, a floater in empty space would be linked to the object alone, and
+every cut would be costlier than including it."""
 _CLUSTER = 12
 """Maximum number of Gaussians in a cluster."""
 _COLOUR_SPLITS = 2
-"""Number of the last halvings of a cluster that may also separate colours."""
+"""Number of final halvings that may also separate colours."""
 _COLOUR_RANGE = 0.3
-"""Range of a colour channel, 0 to 1, that separates a cluster as much as its whole extent."""
+"""Range of a colour channel, 0 to 1, that is equivalent to the longest side of a cluster when the cluster is halved."""
 _MIN_PART = 8
-"""Minimum number of clusters of a part."""
+"""Minimum number of clusters in the part that a click selects."""
 _MAX_EXTENT = 0.9
-"""Fraction of the capture's diagonal along the ground: what one click selects is not longer."""
+"""Maximum extent along the ground of the part that one click selects, as a fraction of the capture's diagonal."""
 _FOOT = 0.015
 """Fraction of the object's size. Within this height above the ground, Gaussians link nothing."""
 _FIRST_FOOT = 0.1
-"""The same before the size is known, as a fraction of the lowest click's height."""
+"""Foot height before the object's size is known, as a fraction of the lowest click's height above the ground."""
 _LEVEL_FOOT = 3.0
-"""Multiple of that height below which Gaussians that lie flat along the ground link nothing."""
+"""Multiple of the foot height below which Gaussians that lie flat along the ground link nothing."""
 _MIN_STANDING = 0.25
-"""Share of a cluster's Gaussians above the ground from which it does not count as ground."""
+"""Share of a cluster's Gaussians that must stand above the foot height; otherwise the cluster is ground."""
 _GROUND_WEIGHT = 0.5
-"""Cost of a link to the ground, relative to its strength: every object has some at its foot."""
+"""Cost of cutting a link to the ground, relative to its strength: every object has such links at its foot."""
 _MAX_REMOVED = 2.0 / 3.0
-"""Share of a proposal that one click beside the object removes, if no click is on the object."""
+"""Maximum share of a proposal that one click beside the object removes if no click is on the object."""
 _UNDER = 0.1
-"""Fraction of the object's size. The outline of the parts below this height is that of its foot."""
+"""Fraction of the object's size. The outline of the object's parts below this height is the outline of its foot."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +62,13 @@ class ClickGraph:
 
     cloud: GaussianCloud
     cluster: np.ndarray
-    """(n,) int32, cluster of each Gaussian; that of the nearest opaque one if it is faint."""
+    """(n,) int32, cluster of each Gaussian; a faint Gaussian has the cluster of the nearest opaque one."""
     links: SplatGraph
     """Links between clusters."""
     middles: np.ndarray
-    """(k, 3) middle of each cluster, scene units."""
+    """(k, 3) centre of each cluster, scene units."""
     means: np.ndarray
-    """(n, 3) float64, scene units."""
+    """(n, 3) float64, means of the Gaussians, scene units."""
 
     @classmethod
     def of(cls, cloud: GaussianCloud) -> ClickGraph:
@@ -107,10 +108,10 @@ def segment_by_clicks(
 ) -> np.ndarray:
     """Find the Gaussians of the object that the clicks describe.
 
-    Each click on the object adds a part: of all sets of clusters nearer to the click than some distance along the
-    links, the one with the weakest boundary for its size. Clicks beside the object then remove what a minimum cut
-    separates from those on it; without a click on it, they remove the part around them from the proposal. The ground
-    separates: links within its foot height are ignored.
+    Each click on the object adds a part. The candidates are the sets of clusters nearer to the click than some distance
+    along the links, and the part is the candidate with the weakest boundary for its size. Clicks beside the object then
+    remove everything that a minimum cut separates from the clicks on it; without a click on it, they remove the part
+    around them from the proposal. Links within the foot height above the ground are ignored.
 
     Args:
         graph: the prepared capture.
@@ -139,7 +140,7 @@ def segment_by_clicks(
             return chosen
         size = float(np.linalg.norm(np.subtract(*np.quantile(graph.means[chosen], [0.995, 0.005], axis=0))))
         foot = _FOOT * size
-    # What is not linked and under the object is its foot, unless it has the colours of the floor.
+    # Gaussians under the object without links are its foot, unless they have the colours of the floor.
     low = ~linked & (heights > foot) & (heights < _UNDER * size)
     chosen |= low & scene.is_under(chosen, _UNDER * size, size)
     for hit in others:
@@ -151,8 +152,8 @@ def segment_by_clicks(
 
 
 def _consistent_hits(graph: ClickGraph, clicks: Sequence[Click]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return the hits of the clicks on the object and of those beside it, without the clusters that a later click of
-    the other kind hits."""
+    """Return the hits of the clicks on the object and of the clicks beside it. Clusters that a later click of the other
+    kind hits are left out."""
     hits: dict[bool, list[np.ndarray]] = {True: [], False: []}
     claimed = {kind: np.zeros(graph.links.count, bool) for kind in hits}
     for click in reversed(clicks):
@@ -171,7 +172,7 @@ def _chosen(
     flat: np.ndarray,
     proposal: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) bool, the object, and (n,) bool, the Gaussians that link others, which are some of the ``standing`` (n,)
+    """Return (n,) bool, the object, and (n,) bool, the Gaussians that link others, a subset of the ``standing`` (n,)
     bool ones. ``flat`` (k, 2) are the coordinates of the clusters along the ground."""
     count = graph.links.count
     share = np.bincount(graph.cluster, weights=standing, minlength=count)
@@ -228,10 +229,10 @@ def _part_around(
     """(m,) bool, the part around ``seeds`` (k,) with the weakest boundary for its size.
 
     The candidates are the sets of nodes up to each distance along the links (sweep cut; Spielman and Teng 2004). The
-    measure is the strength of the links that leave a set, with the links ``at_ground`` (m,) of each node to the ground,
-    divided by the root of the strength of all links of its nodes: on a surface both grow alike, so that it favours no
-    size. Sets whose diagonal in the coordinates ``flat`` (m, 2) exceeds ``extent`` are excluded, because a room is not
-    an object, and so are sets of more than ``max_nodes`` nodes.
+    measure is the strength of the links that leave a set, including the links ``at_ground`` (m,) of its nodes to the
+    ground, divided by the square root of the strength of all links of its nodes. On a surface both are proportional to
+    the set's diameter, so the measure favours no size. Sets whose diagonal in the coordinates ``flat`` (m, 2) exceeds
+    ``extent`` are excluded, because a room is not an object, and so are sets of more than ``max_nodes`` nodes.
     """
     distances = links.distances(seeds)
     order = np.argsort(distances, kind="stable")
@@ -254,9 +255,10 @@ def _part_around(
 
 
 def _without(links: SplatGraph, seeds: np.ndarray, removed: np.ndarray) -> np.ndarray:
-    """(m,) bool, the nodes that a minimum cut leaves with ``seeds`` (k,) and not with ``removed`` (l,), both not empty.
+    """(m,) bool, the nodes that a minimum cut assigns to ``seeds`` (k,) rather than to ``removed`` (l,); neither may be
+    empty.
 
-    The score of a node prefers the seeds that are nearer along the links. Parts without links to a removed node stay.
+    The score of a node compares its distances along the links from both. Parts without links to a removed node remain.
     """
     near, away = links.distances(seeds), links.distances(removed)
     score = np.ones(links.count)
@@ -288,8 +290,8 @@ def _gaps(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph) -> np.ndar
 
 
 def _clusters(points: np.ndarray, colours: np.ndarray) -> np.ndarray:
-    """(n,) int32, clusters of at most ``_CLUSTER`` Gaussians each: repeated halves along the longest side, at the end
-    also by colour."""
+    """(n,) int32, clusters of at most ``_CLUSTER`` Gaussians each, made by repeated halving along the longest side; the
+    last halvings also separate colours."""
     count = len(points)
     levels = max(0, int(np.ceil(np.log2(max(count, 1) / _CLUSTER))))
     values = np.concatenate([points, colours], axis=1)

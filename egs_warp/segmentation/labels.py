@@ -14,11 +14,11 @@ from egs_warp.segmentation.graph_cut import SplatGraph
 from egs_warp.segmentation.votes import Votes
 
 _MIN_VISIBLE_SHARE = 0.02
-"""If the masked views show less than this share of a Gaussian, their votes do not label it."""
+"""Minimum visible share of a Gaussian in the masked views; below it, the votes do not label the Gaussian."""
 _SURE = 4.0
-"""Pixels. A Gaussian with this many votes has full confidence."""
+"""Vote, in pixels, from which a Gaussian has full confidence."""
 _SMOOTHNESS = 0.3
-"""Cost of a neighbour with a different label, relative to a unanimous vote."""
+"""Cost of a neighbour with a different label, relative to a unanimous vote with full confidence."""
 
 
 def labels_of_votes(votes: Votes, *, background_bias: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -40,13 +40,15 @@ def labels_of_votes(votes: Votes, *, background_bias: float = 0.0) -> tuple[np.n
 def smoothed_labels(
     cloud: GaussianCloud, votes: Votes, nodes: np.ndarray, clicks: Sequence[Click] = (), *, views: int = 1
 ) -> np.ndarray:
-    """(m,) bool labels of the ``nodes`` (m,), indices of ``cloud``, by the minimum cut.
+    """(m,) bool labels of the ``nodes`` (m,), indices of ``cloud``, by a minimum cut.
 
-    The score of a node is its vote, 0 for a node that no view shows; what ``clicks`` hit is certain. With several
-    ``views`` the confidence grows with the root of their number, as errors of independently drawn masks average out.
+    The score of a node is its vote, or 0 if no view shows it; nodes that ``clicks`` hit have fixed labels. With several
+    ``views`` the confidence grows with the square root of their number, because errors of independently drawn masks
+    average out.
     """
     pixels = (votes.inside + votes.outside)[nodes]
-    # Above full confidence, it grows with the root of the number of pixels, like the precision of any count.
+    # Above full confidence, the score grows with the square root of the number of pixels, like the precision of a
+    # count.
     confidence = np.minimum(pixels / _SURE, np.sqrt(np.maximum(pixels / _SURE, 1.0)))
     score = (2.0 * votes.share_inside()[nodes] - 1.0) * confidence * np.sqrt(views)
     score[votes.share_seen()[nodes] < _MIN_VISIBLE_SHARE] = 0.0

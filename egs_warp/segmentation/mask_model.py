@@ -1,6 +1,7 @@
-"""Networks that segment pictures: one that takes clicks, from a user's file, and one for saliency.
+"""Networks that segment pictures: a click-prompted one from a user's file, and one for saliency.
 
-The first has the interface of EfficientSAM's ONNX files (Xiong et al. 2024), in one file without external data:
+The click-prompted network has the interface of EfficientSAM's ONNX files (Xiong et al. 2024), in one file without
+external data:
 
 * inputs, with names that contain ``image``, ``coord`` and ``label``, float32: the picture (1, 3, 1024, 1024), RGB from
   0 to 1, in the upper left corner and black elsewhere; six points (1, 1, 6, 2), x and y in its pixels; and their labels
@@ -92,7 +93,7 @@ class OnnxClickModel:
 
 @dataclass(frozen=True)
 class SalientModel:
-    """U2-Net (Qin et al. 2020), which finds the salient object without clicks."""
+    """U2-Net (Qin et al. 2020), which finds the salient object in a picture without clicks."""
 
     network: OnnxNetwork
 

@@ -1,4 +1,4 @@
-"""Search for the Gaussians of an object: votes of masks, a box or a point, then connected parts above the plane."""
+"""Search for an object's Gaussians: votes of masks, a box or a point, then connected parts above the plane."""
 
 from __future__ import annotations
 
@@ -25,27 +25,29 @@ _NOTHING_ABOVE = (
 _MAX_FLOATER_MASS = 0.01
 """Fraction of the object's opacity mass. A smaller connected part is a floater."""
 _MIN_PART_MASS = 0.05
-"""Fraction of the largest connected part. Another part claimed by masks belongs to the object if it is larger."""
+"""Fraction of the mass of the largest connected part. Another part claimed by masks belongs to the object if it has
+more."""
 _HOLLOW = 0.35
 """Fraction of the object's size: maximum distance of a point in the middle of a hollow body from its surface."""
 TOUCHING = 0.1
 """Fraction of the object's size. An object higher above a plane does not stand on it."""
 FOOTPRINT_HEIGHT = 0.08
-"""Fraction of the object's size. Parts below this height hide the floor."""
+"""Fraction of the object's size. The parts of the object below this height hide the floor."""
 _HALO = 0.1
-"""Fraction of the object's size. Floaters this near to the object are its halo."""
+"""Fraction of the object's size. Floaters within this distance of the object are its halo."""
 _HALVINGS = 6
 """Maximum number of halvings of the first guess of an object's size, about a point in a large room."""
 _MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.3, 4.0
-"""Fractions of a guessed size. Much smaller or larger objects do not match the guess."""
+"""Fractions of a guessed size. An object much smaller or larger than the guess does not match it."""
 _HANGING = 0.5
 """Fraction of the object's size. A part that is entirely higher above the plane does not stand on it."""
 _MIN_HAZE_WIDTH, _MIN_HAZE_WIDTH_RATIO, _MAX_HAZE_OPACITY = 0.05, 4.0, 0.3
-"""Width as a fraction of the object's size and as a multiple of the median width of its Gaussians, and opacity. Wider
-and fainter Gaussians are haze about the object and would move with it as a halo."""
+"""Minimum width of haze, as a fraction of the object's size and as a multiple of the median width of the object's
+Gaussians, and its maximum opacity. Gaussians wider and fainter than this would move with the object as a halo."""
 _MAX_HAZE_GAP, _MAX_COLOUR_DIFFERENCE, _NEIGHBOURS = 0.05, 0.15, 16
-"""Fraction of the object's size; fraction of full brightness in each channel; number of Gaussians. Haze this near to
-the object, and this similar in colour to its nearest Gaussians, is part of the object's own haze."""
+"""Maximum distance of haze from the object, as a fraction of its size; maximum difference of each colour channel, 0 to
+1; and number of nearest Gaussians of the object with which the colour is compared. Haze within both limits is the
+object's own."""
 _FOOT = 0.015
 """Fraction of the object's size. Within this height above the plane, floor and object cannot be separated by
 connectivity."""
@@ -62,7 +64,7 @@ def segment(
     """Find the object that ``spec`` describes and that stands on ``plane`` or on uneven ground.
 
     Around a point, the object's size is first guessed as half of the capture's. If nothing of that size stands on the
-    plane, as often in a room, the guess is halved repeatedly.
+    plane, which is common in a room, the guess is halved repeatedly.
 
     Args:
         cloud: the capture.
@@ -146,8 +148,8 @@ def _of_size(
     outline = scene.is_under(chosen, max(3.0 * foot, FOOTPRINT_HEIGHT * size), size)
     near = close_to(scene.means, scene.means[chosen], 2.0 * size / CELLS)
     above = scene.heights > foot
-    # Masks, if given, also decide about the foot; otherwise the foot is what stands under the object and above the
-    # floor.
+    # Masks, if given, also decide which Gaussians are the foot; otherwise the foot is everything under the object and
+    # above the floor.
     claimed = claimed_by_user & near & bool(spec.masks)
     standing = (scene.heights > floor) & scene.is_under(chosen, 3.0 * foot, size)
     at_foot = ~above & (scene.heights > 0.0) & (claimed if spec.masks else standing)
@@ -193,10 +195,10 @@ def _haze_indices(scene: SceneAbovePlane, object_indices: np.ndarray, size: floa
 
 
 def _is_own_haze(scene: SceneAbovePlane, haze: np.ndarray, object_mask: np.ndarray, size: float) -> np.ndarray:
-    """(k,) bool, True for the Gaussians ``haze`` (k,) within the object ``object_mask`` (n,) bool, or near it with its
-    colours.
+    """(k,) bool, True for the Gaussians ``haze`` (k,) that are inside the object ``object_mask`` (n,) bool, or near it
+    with similar colours.
 
-    Left in the background, it would look like a ghost of the object.
+    In the background, this haze would remain as a ghost of the object.
     """
     own = scene.is_within(haze, object_mask, size)
     if len(haze) == 0 or not object_mask.any():
@@ -212,8 +214,8 @@ def _is_own_haze(scene: SceneAbovePlane, haze: np.ndarray, object_mask: np.ndarr
 def _body(
     scene: SceneAbovePlane, claimed_by_user: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, foot: float, size: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n,) bool, the connected parts of the object, all of them higher than ``foot``; (n,) bool, all other parts that
-    are small; and (n,) bool, Gaussians that clicks removed."""
+    """Return (n,) bool, the connected parts of the object, all of them higher than ``foot``; (n,) bool, all other small
+    parts; and (n,) bool, Gaussians that clicks removed."""
     core = (claimed_by_user | unknown) & scene.is_opaque & (scene.heights > foot)
     if spec.picked is not None:
         if not core.any():
@@ -235,7 +237,7 @@ def _body(
                 f"object: nothing solid above the plane within {_HOLLOW * size:.3g} of the point "
                 f"{','.join(f'{v:g}' for v in spec.point)}; give a point on the object, in the capture's units"
             )
-        # The nearest part with enough mass, so that strays and loose matter inside the object are not chosen.
+        # Choose the nearest part with enough mass: not a stray, and not a floater inside the object.
         around = np.unique(parts[away < _HOLLOW * size])
         around = around[mass[around] > 0.05 * mass[around].max()]
         best = int(around[np.argmin([away[parts == one].min() for one in around])])
@@ -259,13 +261,13 @@ def _body(
     chosen &= ~removed
     if not chosen.any():
         raise UserError(_nothing_left("the clicks beside the object remove all of it", int(removed.sum())))
-    # Distant strays, connected by some huge Gaussian, would extend the following steps over the whole room.
+    # Distant strays that some huge Gaussian connects would extend the following steps over the whole room.
     chosen &= _within(scene.means, chosen, size)
-    # Loose matter inside a hollow body would stay behind as a ghost. The floor closes the body from below, and so does
-    # its mirror image in the floor.
+    # Floaters inside a hollow body would remain in the background as a ghost. The floor closes the body from below, and
+    # so does the body's mirror image in the floor.
     shell = scene.means[chosen]
     if _diagonal(shell) > _MAX_SIZE_RATIO * size:
-        # There would be too many cells: a room divided into cells for a small object.
+        # There would be too many cells if a whole room were divided into cells for a small object.
         raise UserError(_NOTHING_ABOVE, check=("plane",))
     heights = scene.heights[chosen]
     # An object high above the plane is not closed by the floor; the shell and its mirror image would span a very large
@@ -274,7 +276,7 @@ def _body(
         shell = np.concatenate([shell, shell - 2.0 * (heights[:, None] - foot) * scene.plane.normal])
     chosen |= enclosed(scene.means, shell, 2.0 * size / CELLS) & (scene.heights > foot)
     chosen |= lying & scene.is_under(chosen, 0.1 * size, size)
-    # Gaussians that were added by their position are removed if they are nearer to removed ones.
+    # Gaussians that were added by position are removed again if a removed Gaussian is nearer than one of the object's.
     removed |= nearer_to(scene.means, scene.means[removed], scene.means[chosen & ~removed])
     return chosen & ~removed, small_parts, removed
 

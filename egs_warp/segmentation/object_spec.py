@@ -17,9 +17,9 @@ class Box:
     """An axis-aligned box in the capture's frame."""
 
     low: np.ndarray
-    """(3,) lower corner."""
+    """(3,) corner with the lowest coordinates, scene units."""
     high: np.ndarray
-    """(3,) upper corner."""
+    """(3,) corner with the highest coordinates, scene units."""
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """(n,) bool, True for points (n, 3) in the box."""
@@ -34,11 +34,11 @@ class ObjectSpec:
     masks: tuple[MaskedView, ...] = ()
     box: Box | None = None
     point: np.ndarray | None = None
-    """(3,) on or in the object, scene units."""
+    """(3,) point on or in the object, scene units."""
     clicks: tuple[Click, ...] = ()
-    """Clicks; each adds the Gaussians that it hits and those connected to them, or removes them."""
+    """Clicks, each of which adds the Gaussians that it hits and their connected parts, or removes them."""
     picked: np.ndarray | None = None
-    """(n,) bool, the Gaussians of the object as the user has picked them; nothing is searched for."""
+    """(n,) bool, the object's Gaussians as the user has picked them; no search takes place."""
 
     @classmethod
     def of_clicks(cls, clicks: Sequence[Click]) -> ObjectSpec:
@@ -55,7 +55,7 @@ class Segmentation:
     """The object among the Gaussians of a capture."""
 
     object_mask: np.ndarray
-    """(n,) bool, the object; its means lie above the plane."""
+    """(n,) bool, the object's Gaussians, whose means lie above the plane."""
     buried_mask: np.ndarray
     """(n,) bool, Gaussians under the object's foot or claimed as its parts, with means near or below the plane, mostly
     hidden. They belong to neither object nor background."""

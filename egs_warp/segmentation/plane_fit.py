@@ -13,7 +13,7 @@ from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.plane import Plane
 
 _MAX_PIXELS = 20_000
-"""Maximum number of pixels of all views together; more do not improve a fit of three numbers."""
+"""Maximum number of pixels of all views together; more would not improve a fit of three parameters."""
 _MIN_PIXELS = 30
 _TRIALS = 300
 _TUKEY = 2.0
@@ -21,8 +21,9 @@ _TUKEY = 2.0
 outliers, but an object is close to the plane at its foot: with 3.0, the planes of some of 100 scenes are tilted by a
 degree."""
 _MIN_NOISE = 1e-3
-"""Fraction of the depth. Points nearer to the plane than this count as lying on it. If few wide splats form a floor, a
-plane through three of them has no error in half of the pixels, and the others would have zero weight."""
+"""Fraction of the depth. Points nearer to the plane than this are on it. If a few wide splats form a floor, a plane
+through three of them has zero error in half of the pixels, and without this minimum all other pixels would have zero
+weight."""
 _MIN_SINE = 0.02
 """Minimum sine of the angle between plane and line of sight; at smaller angles the plane is not visible."""
 
@@ -43,9 +44,9 @@ class PlaneFit:
     """A fitted plane and the quality of the fit."""
 
     plane: Plane
-    """Fitted plane; its normal points to the cameras' side."""
+    """Fitted plane; its normal points to the side of the cameras."""
     noise: float
-    """Standard deviation (robust) of relative depth over the pixels on the plane."""
+    """Robust standard deviation of the relative depth error over the pixels on the plane."""
     inlier_share: float
     """Fraction of the masked pixels that the plane explains, 0 to 1."""
     pixel_count: int
@@ -63,9 +64,9 @@ def plane_depth(plane: Plane, camera: Camera) -> np.ndarray:
 def fit_plane(views: Sequence[PlaneView], *, start: Plane | None = None, seed: int = 0) -> PlaneFit:
     """Fit the plane whose depth agrees with the rendered depth inside the masks, in all views together, Eq. (19).
 
-    The residual of a pixel is its relative error in depth, D_g / D_p - 1: for one view it is linear in m = -N / (N.o +
-    d). Up to four tenths of the pixels may be outliers. The start is sampled, or computed from ``start`` (in the paper,
-    the view direction with d = 0) by reweighted least squares on inverse depth.
+    The residual of a pixel is its relative error in depth, D_g / D_p - 1, which for one view is linear in m = -N / (N.o
+    + d). Up to 40 % of the pixels may be outliers. The initial plane is found by random sampling or, if ``start`` is
+    given (in the paper, the view direction with d = 0), by reweighted least squares on inverse depth from there.
 
     Raises ``UserError`` for masks of the wrong size or without depth, and if no plane explains the pixels.
     """
@@ -94,7 +95,7 @@ class _Pixels:
     rays: np.ndarray
     """(p, 3) rays of z-depth 1."""
     depth: np.ndarray
-    """(p,) rendered depth."""
+    """(p,) rendered z-depth of each pixel, scene units."""
     first_view: np.ndarray
     """(p,) bool, pixels of the first view."""
 
@@ -104,7 +105,7 @@ class _Pixels:
         return self.origins + self.depth[:, None] * self.rays
 
     def residuals(self, plane: Plane) -> np.ndarray:
-        """(p,) D_g / D_p - 1 = -(height of the rendered point) / (height of the camera)."""
+        """(p,) D_g / D_p - 1 = -(height of the rendered point) / (height of the camera), heights over ``plane``."""
         camera = self.origins @ plane.normal + plane.offset
         least = 1e-9 * np.abs(self.depth)
         camera = np.where(np.abs(camera) < least, least, camera)
@@ -187,12 +188,12 @@ def _reweighted(pixels: _Pixels, start: Plane) -> Plane:
 
 
 def _refined(pixels: _Pixels, start: Plane, loss: Callable[[float], tuple], *, rounds: int) -> Plane:
-    """Fit two tilts and the offset of the plane by robust least squares, in all views together."""
+    """Fit two tilts and the offset of the plane by robust least squares, in all views together, ``rounds`` times."""
     plane = start
     for _ in range(rounds):
         first, second = plane.tangents()
         base = plane
-        # Tilts are about the middle of the points, so that the three unknowns are nearly independent.
+        # Tilts are about the centre of the points, so that the three unknowns are nearly uncorrelated.
         middle = np.median(pixels.points, axis=0)
         reach = max(float(np.median(np.linalg.norm(pixels.points - middle, axis=1))), 1e-12)
 
@@ -219,8 +220,8 @@ def _refined(pixels: _Pixels, start: Plane, loss: Callable[[float], tuple], *, r
 def _scale(residual: np.ndarray) -> float:
     """Standard deviation of the inliers among absolute residuals; never 0.
 
-    The median alone would be 50 % too large if three tenths are outliers. The estimate starts from a lower quantile
-    instead, and then uses the median of the residuals within two deviations, which is 0.638 deviations.
+    The median alone would overestimate it by 50 % if 30 % of the pixels are outliers. So the estimate starts from a
+    lower quantile and then uses the median of the residuals below two deviations, which is 0.638 deviations.
     """
     scale = max(float(np.quantile(residual, 0.3)) / 0.566, 1e-7)
     for _ in range(10):

@@ -21,8 +21,8 @@ _TRIALS = 1500
 _SAMPLE = 4000
 _MIN_OPACITY = 0.3
 _BAND = 0.03
-"""Fraction of the search radius. Points nearer to the plane belong to it. With 0.06, single views of a real table
-disagreed by 0.8 degree, with 0.03 by 0.3."""
+"""Fraction of the search radius. Points nearer to the plane belong to it. With 0.06, planes fitted to single views of a
+real table differed by 0.8 degrees; with 0.03, by 0.3 degrees."""
 _VIEWS = 8
 """Maximum number of pictures to which a plane is fitted."""
 _MIN_SUPPORT = 0.005
@@ -30,16 +30,16 @@ _MIN_SUPPORT = 0.005
 _CELL = 0.1
 """Fraction of the object's size: side of the cells on which a plane must be one patch."""
 _COVERED = 0.3
-"""Fraction of a cell that must be covered for it to belong to the patch."""
+"""Fraction of a cell's area that must be covered for the cell to belong to the patch."""
 
 
 @dataclass(frozen=True)
 class FoundPlane:
-    """A plane and the share of the surface that lies in it."""
+    """A plane and the share of the visible surface that lies in it."""
 
     plane: Plane
     support: float
-    """0 to 1, share of the visible surface."""
+    """Share of the visible surface that lies in the plane, 0 to 1."""
 
 
 def find_planes(
@@ -69,7 +69,7 @@ def find_planes(
     means, opacity = cloud.means.numpy().astype(np.float64), cloud.opacities()
     scales = np.sort(np.exp(cloud.log_scales.numpy().astype(np.float64)), axis=1)
     area = opacity * scales[:, 1] * scales[:, 2]
-    # A few blurred Gaussians behind everything would outweigh the rest.
+    # Without this limit, a few blurred Gaussians in the background would outweigh all others.
     area = np.minimum(area, np.quantile(area, 0.95))
     rest = np.flatnonzero((opacity >= _MIN_OPACITY) & (area > 0.0))
     if len(rest) < 10:
@@ -109,7 +109,7 @@ def _best_plane(
         return None
     normals, through = normals[level], a[level]
     offsets = -np.einsum("ij,ij->i", normals, through)
-    # The number of points nearby, weighted smoothly: a plane half inside the band scores half.
+    # Smoothly weighted number of points near each plane; the weight is 1 on the plane and 0 at the band's edge.
     scores = np.array(
         [
             np.clip(1.0 - ((points @ normal + offset) / band) ** 2, 0.0, None).sum()
@@ -161,7 +161,7 @@ def refine_plane(
 ) -> PlaneFit:
     """Refit ``plane`` to the depth of ``cloud`` rendered through ``cameras``, Eq. (18), (19).
 
-    The masks are those of ``plane_views``. Raises ``UserError`` if no camera sees the plane.
+    The masks are computed as in ``plane_views``. Raises ``UserError`` if no camera sees the plane.
     """
     surfaces = _surfaces(cloud, plane, cameras, radius, object_mask)
     views = _masked(surfaces, plane, centre, radius, _BAND * radius)
@@ -186,8 +186,8 @@ def plane_views(
     """Return pictures of the surroundings of ``centre`` (3,) in which the plane is masked.
 
     The masks are the pixels whose rendered point (``SeenSurface``) lies within ``band`` (default 3 % of ``radius``) of
-    the plane and within ``radius`` of ``centre`` along it, without those of ``object_mask`` (n,) bool Gaussians.
-    Cameras below the plane, and those that do not see it, are ignored; of more than eight, at most eight are picked
+    the plane and within ``radius`` of ``centre`` along it. Gaussians of ``object_mask`` (n,) bool are not rendered.
+    Cameras below the plane, and cameras that do not see it, are ignored; of more than eight, at most eight are sampled
     evenly.
     """
     surfaces = _surfaces(cloud, plane, cameras, radius, object_mask)
@@ -198,7 +198,7 @@ def _surfaces(
     cloud: GaussianCloud, plane: Plane, cameras: Sequence[Camera], radius: float, object_mask: np.ndarray | None
 ) -> list[SeenSurface]:
     above = [camera for camera in cameras if plane.heights(camera.centre) > 0.1 * radius]
-    # The object is left out of the pictures if it is known, because its foot would pull the fitted plane upwards.
+    # Render without the object if it is known, because its foot would bias the fitted plane upwards.
     if object_mask is not None and object_mask.all():
         raise UserError(
             f"segment: all {cloud.count} Gaussians of the capture belong to the object, so no plane is visible; give"
@@ -239,7 +239,7 @@ def lies_along(cloud: GaussianCloud, plane: Plane | HeightField) -> np.ndarray:
 
 def further_planes(cloud: GaussianCloud, plane: Plane, size: float, count: int) -> list[FoundPlane]:
     """Return at most ``count`` other planes parallel to ``plane``, largest support first."""
-    # Without this condition, slices of walls and of the object would also count as planes.
+    # Without this condition, slices of walls and of the object would also appear as planes.
     lying = lies_along(cloud, plane)
     if not lying.any():
         return []

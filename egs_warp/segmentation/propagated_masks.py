@@ -1,5 +1,5 @@
-"""Masks from clicks in many views: a network segments the object where it was clicked, and the selected Gaussians are
-rendered into the next view and segmented there again (as in SA3D, Cen et al. 2023)."""
+"""Masks in many views from a few clicks: a network segments the object where it was clicked; then the selected
+Gaussians are rendered into the next view, which the network segments from that mask (as in SA3D, Cen et al. 2023)."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _MIN_VISIBLE_FRACTION = 0.002
 _PROMPTS = 3
 """Number of points inside the propagated mask that prompt the network."""
 _MIN_COVERED_FRACTION, _MAX_AREA_RATIO = 0.5, 3.0
-"""Fractions: minimum share of the propagated mask that a new mask must contain, and maximum ratio of its area to that
-of every earlier mask at the object's distance. Otherwise the new mask shows something else."""
+"""Minimum share of the propagated mask that a new mask must contain, and maximum ratio of the new mask's area to the
+largest area of the earlier masks, both at the object's distance. A mask outside these limits shows something else."""
 _MAX_SALIENT_FRACTION, _MIN_OVERLAP = 0.6, 0.5
 """Maximum fraction of a picture that a salient region may cover; and the minimum overlap (intersection over union) of a
 mask with the consensus of all."""
 _HIDDEN = 0.03
-"""Fraction of the depth. A click farther behind the surface that a view shows is not visible there."""
+"""Fraction of the depth. A click that is farther than this behind the visible surface is hidden in that view."""
 
 
 def masks_of_clicks(
@@ -44,7 +44,7 @@ def masks_of_clicks(
     count: int = 8,
     progress: Callable[[int, int], object] = lambda done, of: None,
 ) -> list[MaskedView]:
-    """Return masks in the clicked views, then in others of ``cameras``, well apart, up to ``count`` in all.
+    """Return masks in the clicked views and then in other well-separated ``cameras``, up to ``count`` in all.
 
     The pictures are renders of ``cloud``. A view whose mask contradicts the others is left out.
 
@@ -54,7 +54,7 @@ def masks_of_clicks(
         cameras: further views.
         model: the network.
         count: maximum number of views.
-        progress: called with the number of processed views and of all views.
+        progress: called with the number of processed views and the number of all views.
 
     Raises:
         UserError: no click is on the object, or the network finds nothing there.
@@ -90,7 +90,7 @@ def masks_of_clicks(
 def salient_masks(
     cloud: GaussianCloud, cameras: Sequence[Camera], model: SalientModel, *, count: int = 12
 ) -> list[MaskedView]:
-    """Return salient regions in renders of ``cloud`` through ``count`` of ``cameras``, well apart.
+    """Return salient regions in renders of ``cloud`` through ``count`` well-separated ``cameras``.
 
     Views that contradict most others are left out. Raises ``UserError`` if nothing is salient.
     """
@@ -133,7 +133,7 @@ def _propagate_mask(
 
 
 def _size(mask: np.ndarray, camera: Camera, middle: np.ndarray) -> float:
-    """Area of ``mask`` (H, W) at the distance of ``middle`` (3,), scene units squared."""
+    """Return the area of ``mask`` (H, W) at the distance of ``middle`` (3,), scene units squared."""
     return float(mask.sum()) * (float(np.linalg.norm(camera.centre - middle)) / camera.fx) ** 2
 
 
@@ -143,8 +143,8 @@ def _picture(cloud: GaussianCloud, camera: Camera) -> tuple[np.ndarray, Camera]:
 
 
 def _well_apart(chosen_before: Sequence[Camera], cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """Return ``count`` of ``cameras``, each chosen as the farthest from all earlier ones. They are ordered so that each
-    is near an earlier one or one of ``chosen_before``, because the mask changes little between neighbouring views."""
+    """Return ``count`` of ``cameras`` by farthest-point sampling. They are ordered so that each is near an earlier one
+    or near one of ``chosen_before``, because the mask changes little between neighbouring views."""
     left = [camera for camera in cameras if all(camera is not one for one in chosen_before)]
     places = [camera.centre for camera in chosen_before]
     chosen: list[Camera] = []
@@ -162,8 +162,8 @@ def _well_apart(chosen_before: Sequence[Camera], cameras: Sequence[Camera], coun
 
 
 def _innermost(mask: np.ndarray, count: int) -> np.ndarray:
-    """(k, 2) pixels: the innermost point of ``mask`` (H, W), then repeatedly the innermost of the points farther than
-    twice the depth of each earlier one from it. At most ``count``."""
+    """(k, 2) pixels, at most ``count``: the innermost point of ``mask`` (H, W), then repeatedly the innermost of the
+    remaining points. Points within twice the depth of an earlier one are excluded."""
     places = []
     depth = depth_inside(np.pad(mask, 1))[1:-1, 1:-1]
     rows, columns = np.indices(mask.shape)

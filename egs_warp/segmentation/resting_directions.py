@@ -6,22 +6,24 @@ import numpy as np
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
 _NEIGHBOUR, _STRAY = 8, 3.0
-"""A point is a stray if its 8th neighbour is more than this many times as far away as that of a typical point."""
+"""Rank of a neighbour, and ratio. A point is a stray if its 8th neighbour is more than 3 times as far away as the
+median 8th neighbour of all points."""
 _CONE = np.cos(np.radians(5.0))
-"""Cosine of the angle within which facets of the hull count as one."""
+"""Cosine of the maximum angle between facets of the hull that are merged into one."""
 _SLABS = (0.02, 0.01, 0.006)
 """Thicknesses, as fractions of the object's size, of the successive slabs of its lowest points to which a plane is
 fitted."""
 _LOWEST_SHARE = 0.002
 _MIN_POINTS = 10
 _MIN_WIDTH_RATIO = 0.1
-"""Smallest ratio of the standard deviations across a support: a body does not rest on a line."""
+"""Minimum ratio of the two standard deviations along a support: a body does not rest on a line."""
 _MAX_TURN = np.cos(np.radians(10.0))
-"""Cosine of the maximum angle between the normal of a facet and that of the fitted plane."""
+"""Cosine of the maximum angle between the normals of a facet and of the fitted plane."""
 
 
 def resting_directions(points: np.ndarray, *, at_most: int) -> np.ndarray:
-    """(m, 3) unit up directions, at most ``at_most``, in which ``points`` (n, 3) can rest, those on large facets first.
+    """(m, 3) unit up directions, at most ``at_most``, in which ``points`` (n, 3) can rest, in descending order of the
+    area of their facets.
 
     Empty if the points have no volume.
     """

@@ -1,4 +1,4 @@
-"""Estimate of the plane under an object whose ground is not visible: a body at rest lies as low as it can."""
+"""Estimate of the plane under an object whose ground is not visible: at rest, a body minimises its potential energy."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from egs_warp.segmentation.object_spec import Segmentation
 
 _FINE, _VISIBLE = 0.03, 0.05
 """Maximum width, as a fraction of the object's size, and minimum opacity of fine Gaussians. An object has texture and
-so has fine Gaussians; the haze about it does not. The Gaussians of a computer mouse's plain rear are up to 0.03 wide,
-those of the haze over the desk 0.045 and more."""
+therefore fine Gaussians; the haze about it has none. The plain rear of a computer mouse has Gaussians up to 0.03 wide;
+the haze over its desk has a width of 0.045 and more."""
 _REACH = 0.05
-"""Fraction of the object's size by which it may extend beyond its known outline."""
+"""Maximum extent of the object beyond its known outline, as a fraction of its size."""
 _BELOW = 0.25
-"""Fraction of the object's size by which it may extend below the plane that is known to be wrong."""
+"""Maximum extent of the object below the given plane, which may be wrong, as a fraction of the object's size."""
 _STRAYS = 0.005
 """Fraction of the Gaussians that may lie below the plane: mirror images in a glossy table, and strays."""
 _FRINGE, _FOOT, _HAZE = 0.1, 0.05, 0.1
@@ -36,8 +36,8 @@ def resting_plane(
 ) -> Plane:
     """Return the plane on which the object rests, within ``degrees`` of ``up`` (3,), from its own lowest parts.
 
-    Of all planes below the object, it is the one closest to its centre, which minimises the potential energy (a body
-    stands on a facet of its hull). Only fine Gaussians count; haze has none.
+    Of all planes below the object, it is the one closest to the object's centre, which minimises the potential energy
+    (a body stands on a facet of its hull). Only fine Gaussians are used, because haze has none.
 
     Args:
         cloud: the capture.
@@ -69,8 +69,8 @@ def remove_foot_remnants(cloud: GaussianCloud, plane: Plane, segmentation: Segme
     """Return the segmentation with remnants of the object's foot, its shadow and its mirror image added to the buried
     Gaussians.
 
-    They lie near the object, below the ``plane`` or slightly above it. No floor is visible there that they could belong
-    to.
+    These remnants lie near the object, below the ``plane`` or slightly above it, where no visible floor exists to which
+    they could belong.
     """
     means = cloud.means.numpy()
     low = segmentation.background_mask & (plane.heights(means) < _FOOT * segmentation.size)
@@ -80,8 +80,8 @@ def remove_foot_remnants(cloud: GaussianCloud, plane: Plane, segmentation: Segme
 
 
 def _lowest(points: np.ndarray, up: np.ndarray, reach: float) -> Plane:
-    """Return the plane that maximises the origin's height above the plane; the tangent of its angle to ``up`` is at
-    most ``reach``."""
+    """Return the plane below the ``points`` (n, 3) from which the origin is highest. The tangent of the angle between
+    its normal and ``up`` (3,) is at most ``reach``."""
     axes = np.stack(Plane(up, 0.0).tangents())
     best, step = np.zeros(2), reach / (_GRID_SIZE // 2)
     for _ in range(_ROUNDS):

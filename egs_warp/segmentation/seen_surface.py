@@ -1,9 +1,9 @@
-"""Visible surfaces in a picture, computed from the heights of splats, because depths alone place floors too high.
+"""Visible surfaces in a picture, computed from the heights of splats, because depth alone places floors too high.
 
-A splat's depth is that of its mean. Where splats of a floor overlap, the nearer one hides the other, so the depth of a
-pixel is usually that of a mean nearer than the floor in the pixel: at this depth, the pixel's ray is still above the
-floor, by a fraction of a splat's size. The height of the splat at which half of the light is absorbed does not depend
-on which of the overlapping splats it is.
+The depth of a splat is the depth of its mean. Where splats of a floor overlap, the nearer splat hides the others, so
+the depth in a pixel is usually the depth of a mean that is nearer than the floor at that pixel. At this depth, the
+pixel's ray is still above the floor, by a fraction of a splat's size. The height of the splat at which half of the
+light is absorbed has no such bias: it is the same for all overlapping splats.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ class SeenSurface:
 
     @classmethod
     def of(cls, cloud: GaussianCloud, camera: Camera) -> SeenSurface:
-        """Compute the surface of ``cloud`` seen through ``camera``."""
+        """Compute the surface of ``cloud`` in the picture of ``camera``."""
         image = render_gaussians(cloud, camera, geometry=True)
         assert image.median_depth is not None and image.median_gaussian is not None
-        # The expected depth would contain depths below the floor, because some light passes through it.
+        # The expected depth would be averaged with depths below the floor, because some light passes through the floor.
         middles = cloud.means.numpy().astype(np.float64)[np.asarray(image.median_gaussian.numpy(), np.int64)]
         depth = image.median_depth.numpy().astype(np.float64)
         return cls(camera, depth, middles, (image.alpha.numpy() > _OPAQUE) & (depth > 0.0))
 
     def depth_over(self, plane: Plane) -> np.ndarray:
-        """(H, W) z-depth at which each pixel's ray reaches the height over ``plane`` of the surface in that pixel; 0
-        where it does not.
+        """(H, W) z-depth at which each pixel's ray reaches the height over ``plane`` of the surface seen in that pixel;
+        0 where the ray does not reach it.
 
         ``plane`` must only be roughly parallel to the surface: the error is its tilt times the width of a splat.
         """

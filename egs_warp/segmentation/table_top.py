@@ -1,5 +1,5 @@
-"""Search for the support of an object, the level surface that extends around it, in a room whose widest plane is
-another one."""
+"""Search for the level surface that supports an object, in a room whose widest plane is another one (such as the
+floor)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.plane_search import find_planes, lies_along
 
 _LEVELS = 4
-"""Number of halvings of the capture's half diagonal, the radius about a point in which planes are searched."""
+"""Number of radii about a point within which planes are searched: the capture's half diagonal, halved this many
+times."""
 _MIN_SUPPORT = 0.1
 """Minimum share of the level surface near a point; a plane with less is not a table."""
 _THICKNESS = 0.02
@@ -24,8 +25,8 @@ _LEVEL_DEGREES = 5.0
 _CELL = 0.03
 """Side of a cell, as a fraction of the object's size."""
 _APRON = 3
-"""Width in cells of the apron around the object's outline in which the surface must continue; the cell at the outline
-does not count."""
+"""Width, in cells, of the apron around the object's outline over which the surface must continue; the first cell beyond
+the outline is excluded."""
 _COVERED = 0.3
 """Fraction of a cell that must be covered by the surface."""
 _NEAR = 0.03
@@ -33,8 +34,8 @@ _NEAR = 0.03
 
 
 def planes_below(cloud: GaussianCloud, up: np.ndarray, point: np.ndarray) -> list[Plane]:
-    """Return level planes below ``point`` (3,), highest first. They are searched for in surroundings of half, a
-    quarter, ... of the capture's size."""
+    """Return level planes below ``point`` (3,), highest first. The search runs in neighbourhoods of the point whose
+    radii are a half, a quarter, ... of the capture's diagonal."""
     means, opaque = cloud.means.numpy().astype(np.float64), cloud.opacities() > 0.3
     if not opaque.any():
         return []
@@ -59,7 +60,7 @@ def planes_below(cloud: GaussianCloud, up: np.ndarray, point: np.ndarray) -> lis
 
 
 def surface_around(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> float:
-    """Return the fraction, 0 to 1, of the surroundings of the object's outline on ``plane`` that a parallel surface
+    """Return the fraction, 0 to 1, of the apron around the object's outline on ``plane`` that a parallel surface
     covers."""
     cell, tangents = _CELL * segmentation.size, np.stack(plane.tangents(), axis=1)
     means = cloud.means.numpy().astype(np.float64)

@@ -1,4 +1,4 @@
-"""Votes of masks for each Gaussian: its blending weight inside and outside a mask, summed over pixels.
+"""Votes of masks for each Gaussian: its blending weight inside and outside the masks, summed over pixels.
 
 See docs/concepts/segmentation.md.
 """
@@ -56,12 +56,13 @@ class Votes:
 def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
     """Sum the blending weight of each Gaussian over the pixels inside and outside the masks.
 
-    A Gaussian's blending weight in a pixel is the derivative of the pixel's colour with respect to the Gaussian's own.
-    So the votes are the colour gradient of a picture that weights masked pixels in red and the others in green,
-    computed by the renderer's backward kernels. Raises ``UserError`` for masks whose size is not that of their cameras.
+    A Gaussian's blending weight in a pixel is the derivative of the pixel's colour with respect to the Gaussian's
+    colour. So the votes are the colour gradient of a picture in which masked pixels have weights in red and all others
+    in green, computed by the renderer's backward kernels. Raises ``UserError`` for masks whose size differs from their
+    cameras'.
     """
     sums = np.zeros((cloud.count, 3))
-    # The same grey for all: colours are not clipped, and SH bands above 0 are not needed.
+    # Use the same grey for all Gaussians: colours are not clipped, and SH bands above 0 are not needed.
     grey = replace(cloud, sh=wp.zeros((cloud.count, 1), dtype=wp.vec3, device=cloud.device))
     for view in views:
         check_size(view)
@@ -72,8 +73,8 @@ def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
 def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
     """Sum the votes of all masks. Empty masks, of views in which the object is not visible, are ignored.
 
-    Raises ``UserError`` for masks whose size is not that of their cameras, if all are empty, and if their cameras see
-    nothing.
+    Raises ``UserError`` for masks whose size differs from their cameras', if all masks are empty, and if their cameras
+    see nothing.
     """
     for view in masks:
         check_size(view)
@@ -87,7 +88,7 @@ def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
 
 
 def check_size(view: MaskedView) -> None:
-    """Raise ``UserError`` for a mask whose size is not that of its camera's picture."""
+    """Raise ``UserError`` for a mask whose size differs from the size of its camera's picture."""
     height, width = view.camera.height, view.camera.width
     if view.mask.shape != (height, width):
         raise UserError(

@@ -1,7 +1,7 @@
 """Training through the renderer, with PyTorch: fine-tuning, and training from photographs.
 
-Input: a cloud and views to match. Output: a cloud that matches them. The fine-tuning is also used for L_seg (Eq. 21)
-and for inpainted floor. The kernels are in ``egs_warp/kernels/training``.
+Input: a cloud and views to match. Output: a cloud whose renders match the views. The fine-tuning also minimises L_seg
+(Eq. 21) and trains inpainted floor. The kernels are in ``egs_warp/kernels/training``.
 """
 
 from importlib.util import find_spec

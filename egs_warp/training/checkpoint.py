@@ -1,7 +1,7 @@
 """Checkpoints of a training run: its complete state in one file, written periodically.
 
-The file is an ``.npz`` without pickled objects: arrays by name, all else as JSON under ``facts``. Python writes a float
-as the shortest text that reads back to the same bits.
+The file is an ``.npz`` without pickled objects: arrays by name, and all other values as JSON under ``facts``. JSON
+preserves floats exactly, because Python writes a float as the shortest text that reads back to the same bits.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from egs_warp.version import __version__
 SECONDS = 30.0
 """Minimum time between two checkpoints, s."""
 _SHARE = 0.05
-"""Maximum fraction of the time spent on writing checkpoints."""
+"""Maximum fraction of the training time that is spent on writing checkpoints."""
 
 State = dict[str, Any]
 """Arrays, and values that JSON can represent."""
@@ -35,14 +35,15 @@ class Checkpoint:
     """Checkpoint file of one training run."""
 
     def __init__(self, path: Path, *, resume: bool = False) -> None:
-        """With ``resume`` the training continues from the checkpoint at ``path``; otherwise the file is overwritten."""
+        """Create the checkpoint at ``path``. With ``resume`` the training continues from it; otherwise the file is
+        overwritten."""
         self.path = path
         self._resume = resume
         self._digest = ""
         self._last, self._pause = time.monotonic(), SECONDS
 
     def begin(self, digest: str) -> State | None:
-        """Return the state from which the training with this ``digest`` continues; None for a new one.
+        """Return the state from which the training with this ``digest`` continues; None for a new training.
 
         Raises ``UserError`` if the file cannot be read or belongs to a training with other input.
         """
@@ -67,7 +68,7 @@ class Checkpoint:
         return state
 
     def due(self) -> bool:
-        """Return True if enough time has passed since the last checkpoint for the next one."""
+        """Return True if enough time has passed since the last checkpoint to write the next one."""
         return time.monotonic() - self._last >= self._pause
 
     def write(self, state: State) -> None:
@@ -83,7 +84,8 @@ class Checkpoint:
 
 
 def digest_of(arrays: Iterable[np.ndarray | None], cameras: Iterable[Camera], options: object) -> str:
-    """Return a digest of a training's input: its pictures and first cloud, its ``cameras``, its ``options``."""
+    """Return a digest of a training's input: the ``arrays`` of its pictures and first cloud, its ``cameras``, its
+    ``options``."""
     content = hashlib.sha256(f"{__version__} {options!r}".encode())
     for camera in cameras:
         for one in fields(camera):

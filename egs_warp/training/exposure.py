@@ -10,14 +10,14 @@ from egs_warp.training.checkpoint import State
 _RATE, _LAST_RATE = 1e-2, 1e-4
 """Learning rate of Adam at the start and at the end."""
 _REGULARIZATION = 1e-2
-"""Weight of the squared distance from the mean colour map: what all photos share belongs to the cloud."""
+"""Weight of the squared distance from the mean colour map: changes that all photos share belong to the cloud."""
 
 
 class ExposureModel:
-    """One affine colour map (3, 4) for each view; their mean is fixed at the identity.
+    """One affine colour map (3, 4) for each view. The mean of all maps is fixed at the identity.
 
-    Without that constraint, a darker cloud with brighter maps would fit equally well. Adam updates the views one by
-    one, so that a view that is not rendered does not drift.
+    Without that constraint, a darker cloud with brighter maps would fit equally well. Adam updates each map separately,
+    so that the map of a view that is not rendered does not drift.
     """
 
     def __init__(self, count: int, steps: int, device: str) -> None:
@@ -29,7 +29,7 @@ class ExposureModel:
         self._identity = torch.eye(3, 4, device=device)
 
     def tensor_for(self, number: int) -> torch.Tensor:
-        """(3, 4) colour map of view ``number``, a leaf tensor whose gradient ``step`` uses."""
+        """(3, 4) colour map of view ``number``, a leaf tensor; ``step`` uses its gradient."""
         self._leaf = leaf = (self._identity + self._offsets[number]).requires_grad_()
         return leaf
 
@@ -61,5 +61,5 @@ class ExposureModel:
         self._visits = list(state["visits"])
 
     def matrices(self) -> np.ndarray:
-        """(views, 3, 4) float64 colour maps."""
+        """Return the colour maps of all views, (views, 3, 4) float64."""
         return (self._identity + self._offsets).double().cpu().numpy()

@@ -30,16 +30,16 @@ from egs_warp.training.relocation import Population
 MIN_LOG_SCALE = -10.0
 """Minimum log scale: scales are at least e^-10, as in the paper."""
 _UNSEEN_STEPS = 20
-"""On a GPU, the losses are downloaded once in this number of steps."""
+"""Number of steps, on a GPU, after which their losses are downloaded together."""
 
 
 class Densification(enum.Enum):
     """Changes to the number and positions of Gaussians."""
 
     NONE = "none"
-    """No changes."""
+    """The number and order of Gaussians do not change."""
     RELOCATION = "relocation"
-    """Faint Gaussians move to opaque ones, the number grows to a cap, and means are jittered (MCMC)."""
+    """Faint Gaussians move to opaque ones, the number grows to a cap, and means are perturbed by noise (MCMC)."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class TrainingView:
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Learning rates of Adam by attribute. That of the means is multiplied by the scene's extent and decays to a
+    """Learning rates of Adam by attribute. The rate of the means is multiplied by the scene's extent and decays to a
     hundredth."""
 
     means: float = 1.6e-4
@@ -77,20 +77,20 @@ class FinetuneOptions:
     iterations: int = 1000
     rates: LearningRates = field(default_factory=LearningRates)
     ssim_weight: float = 0.2
-    """Loss = (1 - w) L1 + w (1 - SSIM)."""
+    """Weight w of SSIM in the loss (1 - w) L1 + w (1 - SSIM)."""
     background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
     """Background colour. None draws a random one in each step, which requires views with alpha."""
     densification: Densification = Densification.NONE
     max_gaussians: int | None = 100_000
-    """Number to which relocation grows the cloud. None grows it as long as growth decreases the loss."""
+    """Number to which relocation grows the cloud. With None, the cloud grows as long as growth decreases the loss."""
     sh_steps: int = 0
-    """Steps after which the next SH degree is trained; 0 trains all degrees from the start."""
+    """Number of steps after which the next SH degree is added to the training; 0 trains all degrees from the start."""
     fit_exposure: bool = False
     """Optimise an exposure and a white balance for each view together with the cloud."""
     exclude_outliers: bool = False
     """During the training, exclude views that do not fit the others."""
     antialiased: bool | None = None
-    """Render with antialiasing, and mark the result as trained with it. None: as ``cloud.antialiased``."""
+    """Render with antialiasing, and mark the result as trained with it; None uses ``cloud.antialiased``."""
     seed: int = 0
     threads: int | None = None
 
@@ -100,13 +100,13 @@ class GaussianTensors:
     """Parameters under training, as leaf tensors with the conventions of ``GaussianCloud``."""
 
     means: torch.Tensor
-    """(n, 3) means."""
+    """(n, 3) means, scene units."""
     rotations: torch.Tensor
     """(n, 4) quaternions, w x y z."""
     log_scales: torch.Tensor
-    """(n, 3) log scales."""
+    """(n, 3) natural logarithms of the standard deviations."""
     opacity_logits: torch.Tensor
-    """(n,) opacity logits."""
+    """(n,) logits of the opacities."""
     sh_band_0: torch.Tensor
     """(n, 1, 3) SH coefficients of band 0."""
     sh_rest: torch.Tensor
@@ -121,8 +121,8 @@ class FinetuneResult:
     losses: np.ndarray
     """(iterations,) float64, loss of each step."""
     tones: np.ndarray | None = None
-    """(views, 3, 4) float64: the colours of each view are these times (the cloud's colours, 1). None without
-    ``fit_exposure``."""
+    """(views, 3, 4) float64 colour maps: the colours of each view are its map times (the cloud's colours, 1). None
+    without ``fit_exposure``."""
     outliers: tuple[int, ...] = ()
     """Indices of the excluded views."""
 
@@ -150,7 +150,8 @@ def finetune(
         extra_loss: additional loss of the parameters, for example ``L_seg`` of Eq. (21).
         trainable: (n,) bool, Gaussians that may change; cannot be combined with relocation.
         checkpoint: .npz file, written about every half minute.
-        resume: continue from ``checkpoint``; on a CPU, the result has the same bits as that of an uninterrupted run.
+        resume: continue from ``checkpoint``; on a CPU, the result is bitwise equal to the result of an uninterrupted
+            run.
         progress: called with the index and loss of each step.
 
     Returns:
@@ -178,7 +179,7 @@ def finetune(
     growth = Growth(len(views), options.max_gaussians, device)
     losses = np.zeros(options.iterations)
     pending: list[tuple[int, int, torch.Tensor]] = []
-    # Reading a loss synchronises with the GPU: the losses of many steps are downloaded at once.
+    # Reading a loss synchronises with the GPU, so the losses of many steps are downloaded at once.
     losses_per_download = 1 if device == "cpu" else _UNSEEN_STEPS
     queue: list[int] = []
     stateful = {"population": population, "misfits": outlier_views, "growth": growth} | (
@@ -270,7 +271,7 @@ def _digest(cloud: GaussianCloud, views: Sequence[TrainingView], options: Finetu
 
 
 def _part_of(state: State, name: str) -> State:
-    """Return the state of the part ``name`` in a whole ``state``."""
+    """Return the entries of a whole ``state`` that belong to the part ``name``."""
     return {key.removeprefix(f"{name}/"): value for key, value in state.items() if key.startswith(f"{name}/")}
 
 
@@ -281,7 +282,7 @@ def render_views(
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
     antialiased: bool | None = None,
 ) -> list[TrainingView]:
-    """Render ``cloud`` through ``cameras`` as training views, which replace photos where there are none."""
+    """Render ``cloud`` through ``cameras`` as training views, to be used in place of photos."""
     return [
         TrainingView(
             camera,
@@ -294,16 +295,17 @@ def render_views(
 
 
 def cameras_extent(cameras: Sequence[Camera]) -> float:
-    """Return 1.1 times the radius that contains nine cameras in ten, so that a few wrong poses far away do not enlarge
-    it."""
+    """Return 1.1 times the radius that contains nine tenths of the cameras, so that a few wrong poses far away do not
+    enlarge it."""
     centres = np.array([camera.centre for camera in cameras])
     radius = float(np.quantile(np.linalg.norm(centres - np.median(centres, axis=0), axis=1), 0.9))
     return 1.1 * radius if radius > 0 else 1.0
 
 
 def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
-    """Return the length by which the learning rate of the means is multiplied: 1.1 times the cameras' radius, or twice
-    the mean radius of the cloud if that is smaller."""
+    """Return the length by which the learning rate of the means is multiplied: the smaller of 1.1 times the largest
+    distance of a camera from the cameras' mean position, and twice the mean distance of the Gaussians from their median
+    position."""
     centres = np.array([camera.centre for camera in cameras])
     of_cameras = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     means = cloud.means.numpy()

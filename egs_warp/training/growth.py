@@ -1,4 +1,4 @@
-"""Number of Gaussians of a scene: a given cap, or growth as long as it decreases the loss."""
+"""Number of Gaussians of a scene: a given cap, or growth that ends when it no longer decreases the loss."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ import torch
 from egs_warp.training.checkpoint import State
 
 _MIN_STEPS = 300
-"""Minimum number of steps whose losses are averaged, rounded up to whole rounds of the views."""
+"""Minimum number of steps whose losses are averaged; it is rounded up to whole rounds of the views."""
 _MIN_GAIN = 0.02
-"""Relative decrease of the loss for each e-fold of Gaussians; below it, more Gaussians are not worth their time."""
+"""Minimum relative decrease of the loss when the number of Gaussians grows by a factor of e; below it, growth is not
+worth the computing time."""
 _WINDOWS = 2
-"""Consecutive comparisons with too small a gain after which growth ends."""
+"""Number of consecutive comparisons below ``_MIN_GAIN`` after which growth ends."""
 _BYTES_EACH = 4000
 """Memory of one Gaussian in training, bytes: parameters, gradients, Adam's moments, and the renderer's arrays."""
 
 
 class Growth:
-    """Cap on the number of Gaussians. Without a given cap, it is set to the current number once growth no longer
-    decreases the loss."""
+    """Cap on the number of Gaussians. Without a given cap, the cap is set to the current number as soon as growth no
+    longer decreases the loss."""
 
     def __init__(self, views: int, requested: int | None, device: str) -> None:
         self.requested = requested
@@ -32,7 +33,7 @@ class Growth:
         self._idle = 0
 
     def see(self, loss: float, count: int) -> None:
-        """Record the loss of one step, made with ``count`` Gaussians."""
+        """Record the loss of one step, computed with ``count`` Gaussians."""
         self._losses.append(loss)
         if len(self._losses) < self._window:
             return

@@ -1,4 +1,4 @@
-"""Initial cloud of a training from photos: Gaussians where the photos agree.
+"""Initial cloud for training from photos: Gaussians where the colours of the photos agree.
 
 This module imports torch through ``egs_warp.training.finetune``; import it only where a training runs.
 """
@@ -24,7 +24,7 @@ _SIZE_OF_POINT, _OPACITY_OF_POINT = 1.0, 0.1
 
 
 def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
-    """(3,) point nearest to all optical axes, in the least-squares sense."""
+    """(3,) point nearest to the optical axes of all ``cameras``, in the least-squares sense."""
     centres = np.array([camera.centre for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -34,11 +34,11 @@ def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
 def initial_cloud(
     views: Sequence[TrainingView], *, count: int, sh_degree: int, seed: int = 0, device: str | None = None
 ) -> GaussianCloud:
-    """Create ``count`` isotropic Gaussians, spread evenly over the region that most cameras see, in the colours that
-    they see there.
+    """Create ``count`` isotropic Gaussians, spread evenly over the region that most cameras see, in the colours of the
+    photos there.
 
-    Of many random points, those on whose colour the views agree best are chosen. If all views have alpha, only points
-    inside all silhouettes are used: a rough visual and photometric hull.
+    Of many random points, those whose colour varies least between the views are chosen. If all views have alpha, only
+    points inside all silhouettes are used: a rough visual and photometric hull.
     """
     centres = np.array([view.camera.centre for view in views])
     focus = middle_of([view.camera for view in views])
@@ -57,7 +57,8 @@ def initial_cloud(
     candidates = np.flatnonzero(visibility.solid if visibility.solid.any() else visibility.often)
     if len(candidates) == 0:
         raise UserError("train: the cameras have no common view; check the poses")
-    # Empty space before a plain backdrop agrees as well as a surface does, so half of the points are chosen at random.
+    # Empty space in front of a plain backdrop varies as little as a surface, so half of the points are chosen at
+    # random.
     best = candidates[np.argsort(visibility.spread[candidates], kind="stable")][: count // 2]
     rest = random.permutation(np.setdiff1d(candidates, best))[: count - len(best)]
     chosen = np.concatenate([best, rest])
@@ -79,8 +80,8 @@ def initial_cloud(
 def cloud_from_points(
     points: SparsePoints, *, count: int | None, sh_degree: int, seed: int = 0, device: str | None = None
 ) -> GaussianCloud:
-    """Create isotropic Gaussians at ``points``, at most ``count`` of them, each as large as the distance to its three
-    nearest neighbours."""
+    """Create isotropic Gaussians at ``points``, at most ``count`` of them. The size of each is the root mean square
+    distance to its three nearest neighbours."""
     positions, colours = points.positions, points.colours
     if count is not None and len(positions) > count:
         chosen = np.sort(np.random.default_rng(seed).permutation(len(positions))[:count])
@@ -106,13 +107,13 @@ class _Visibility:
     """Colour and visibility of n points in all views together."""
 
     colour: np.ndarray
-    """(n, 3) mean over the views that see the point."""
+    """(n, 3) mean colour over the views that see the point."""
     spread: np.ndarray
-    """(n,) standard deviation of the colour."""
+    """(n,) standard deviation of the colour over these views."""
     often: np.ndarray
-    """(n,) bool, True for points seen by at least half as many views as the point seen most."""
+    """(n,) bool, True for points that are seen by at least half as many views as the most often seen point."""
     solid: np.ndarray
-    """(n,) bool, True for points seen often that are inside the silhouettes of nearly all views; all False unless all
+    """(n,) bool, True for often seen points that are inside the silhouettes of nearly all views; all False unless all
     views have alpha."""
 
     @classmethod
@@ -140,6 +141,6 @@ class _Visibility:
             colour=mean,
             spread=np.sqrt(np.maximum(squares / known[:, None] - mean**2, 0).sum(axis=1)),
             often=often,
-            # One mask in ten may miss a part.
+            # One mask in ten may wrongly exclude a part of the object.
             solid=often & (alpha > 0.9 * known),
         )

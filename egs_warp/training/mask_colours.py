@@ -22,22 +22,22 @@ _MAX_MASKS = 24
 _SIDE = 64
 """Longer side to which masks are reduced, pixels."""
 _MIN_RIM = 0.85
-"""Minimum mean fraction of white pixels along the border, beyond which the white region is the surroundings."""
+"""Minimum mean fraction of white pixels along the border at which the white region is taken for the surroundings."""
 _AREA = (0.01, 0.6)
-"""Range of the mean fraction of black pixels."""
+"""Range of the mean fraction of black pixels in masks that show the object in black."""
 _POINTS = 40_000
 _MIN_SEEN, _MIN_BLACK = 0.8, 0.95
-"""A point of the hull is seen by at least the first fraction of the cameras, and black in at least the second fraction
-of these."""
+"""A point of the hull is seen by at least the first fraction of the cameras, and is black in at least the second
+fraction of the cameras that see it."""
 _MIN_COVERED = 0.7
 """Minimum fraction of the black pixels that the hull covers."""
 
 
 def is_object_black(images: Sequence[PosedImage]) -> bool:
-    """Return True if there is clear evidence that the masks of ``images`` show the object in black: the surroundings,
-    along the borders, are white, and the black regions are the silhouettes of one body that all cameras see.
+    """Return True if there is clear evidence that the masks of ``images`` show the object in black: the surroundings
+    along the borders are white, and the black regions are the silhouettes of one body that all cameras see.
 
-    Black regions that move from photo to photo, such as people to be left out, are not silhouettes of one body.
+    Black regions that move from photo to photo, such as masked-out people, are not silhouettes of one body.
     """
     masked = [one for one in images if one.mask is not None]
     if len(masked) < _MIN_MASKS:
@@ -69,7 +69,7 @@ class _MaskView:
     """Camera at the size of the reduced mask."""
     lens: Lens | None
     black: np.ndarray
-    """(H, W) bool."""
+    """(H, W) bool, True for black pixels."""
 
     @classmethod
     def of(cls, one: PosedImage) -> _MaskView | None:
@@ -117,7 +117,7 @@ class _MaskView:
 
 
 def _hull(views: Sequence[_MaskView], points: np.ndarray) -> np.ndarray:
-    """Return the ``points`` (n, 3) that nearly all views see in black."""
+    """Return the ``points`` (n, 3) that nearly all views see and show in black."""
     seen, black = np.zeros(len(points)), np.zeros(len(points))
     for view in views:
         (rows, columns), inside = view.pixels(points)

@@ -28,24 +28,25 @@ def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def ssim_of(a: np.ndarray, b: np.ndarray, known: np.ndarray | None = None) -> float:
-    """``ssim`` of two pictures (H, W, 3); pixels that are not ``known`` (H, W) count as equal."""
+    """Compute ``ssim`` of two pictures (H, W, 3); pixels that are not ``known`` (H, W) are treated as equal."""
     if known is not None:
         a = np.where(known[:, :, None], a, b)
     return float(ssim(torch.as_tensor(a, dtype=torch.float32), torch.as_tensor(b, dtype=torch.float32)))
 
 
 def psnr(a: np.ndarray, b: np.ndarray, known: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of two pictures (H, W, 3) in 0 to 1 over the ``known`` (H, W) pixels; at most
+    """Peak signal-to-noise ratio, dB, of two pictures (H, W, 3) in 0 to 1 over the ``known`` (H, W) pixels; at most
     100."""
     squared_error = (a.astype(np.float64) - b) ** 2
     return float(-10.0 * np.log10(max(float(np.mean(squared_error if known is None else squared_error[known])), 1e-10)))
 
 
 def match_tone(photo: np.ndarray, picture: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
-    """(H, W, 3) ``picture`` after the affine colour map that best fits it to ``photo`` in the ``known`` (H, W) pixels.
+    """Return ``picture`` (H, W, 3) after the affine colour map that best fits it to ``photo`` in the ``known`` (H, W)
+    pixels.
 
-    The map, twelve numbers fitted to the whole photo, removes differences of exposure and white balance, as is common
-    in the evaluation of held-out photos.
+    The map has twelve numbers and is fitted to the whole photo. It removes differences of exposure and white balance,
+    as is common in the evaluation of held-out photos.
     """
     target, seen = (of.reshape(-1, 3) if known is None else of[known] for of in (photo, picture))
     rows = np.column_stack([seen, np.ones(len(seen))]).astype(np.float64)

@@ -1,7 +1,4 @@
-"""Outlier photos: those whose loss stays high when all others fit.
-
-Their pose is wrong, or something moved.
-"""
+"""Outlier photos: their loss remains high when all others fit, because their pose is wrong or something moved."""
 
 from __future__ import annotations
 
@@ -10,17 +7,17 @@ import numpy as np
 from egs_warp.training.checkpoint import State
 
 _JUDGED_AT = (0.3, 0.5, 0.7)
-"""Fractions of the steps after which outliers are determined."""
+"""Fractions of the training's steps after which outliers are determined."""
 _LAST_VISITS = 3
 _TIMES_MEDIAN = 1.8
 _SPREADS = 3.0
-"""Minimum distance of an outlier from the median, in robust standard deviations of the logarithm of the loss."""
+"""Minimum distance of an outlier's loss from the median, in robust standard deviations of the logarithm of the loss."""
 _MAX_EXCLUDED_FRACTION = 0.1
 """Maximum fraction of the photos that may be excluded."""
 
 
 class OutlierViews:
-    """Records the losses of all views; ``indices`` are those of the views to exclude."""
+    """Records the losses of all views; ``indices`` contains the views to exclude."""
 
     def __init__(self, count: int) -> None:
         self.indices: list[int] = []
@@ -32,8 +29,8 @@ class OutlierViews:
         self._losses[number].append(loss)
 
     def find(self, done: float) -> None:
-        """Search for views with high losses, at three times during the training; ``done`` is the fraction of the
-        steps."""
+        """Search for views with high losses at the times in ``_JUDGED_AT``; ``done`` is the fraction of the steps, 0 to
+        1."""
         if self._judged == len(_JUDGED_AT) or done < _JUDGED_AT[self._judged]:
             return
         self._judged += 1
@@ -55,7 +52,7 @@ class OutlierViews:
 
 
 def is_outlier(losses: np.ndarray) -> np.ndarray:
-    """(n,) bool, True for ``losses`` (n,) that are far above the others; all False for fewer than eight."""
+    """(n,) bool, True for ``losses`` (n,) that are far above the others; all False if there are fewer than eight."""
     if len(losses) < 8:
         return np.zeros(len(losses), bool)
     logarithms = np.log(np.maximum(losses, 1e-12))

@@ -20,19 +20,19 @@ if TYPE_CHECKING:
     from egs_warp.training.finetune import TrainingView
 
 _PHOTO_SIDE = 320
-"""Longer side in pixels: enough for the few Gaussians at an object's foot."""
+"""Longer side of a photo in pixels: enough for the few Gaussians at an object's foot."""
 _OPAQUE = 0.98
-"""Minimum opacity of the capture at pixels from which colours are matched."""
+"""Minimum opacity of the capture at pixels whose colours are matched."""
 _MATCHING_ROUNDS, _MATCHED_PIXELS = 20, 10_000
-"""Rounds of choosing the pixels that agree, and the number of pixels used, when a photo's colours are matched to the
-capture's."""
+"""Number of rounds that select the best-matching pixels, and maximum number of pixels, in the fit of a photo's colours
+to the capture's."""
 _REGULARIZATION = 1e-5
-"""Weight that pulls the mixing matrix towards the gains of the single channels."""
+"""Weight of the distance between the mixing matrix and the diagonal matrix of the channels' own gains."""
 
 
 def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage]) -> list[TrainingView]:
-    """Read the photos of the cameras ``posed``, reduced to ``_PHOTO_SIDE`` pixels and in the colours of ``cloud``. The
-    list is empty without PyTorch."""
+    """Read the photos of the cameras ``posed``, reduced to ``_PHOTO_SIDE`` pixels and converted to the colours of
+    ``cloud``. The list is empty without PyTorch."""
     if not has_torch():
         return []
     from egs_warp.training.finetune import TrainingView
@@ -42,12 +42,13 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
         try:
             picture = read_photo(one)
         except UserError:
-            # ``train`` reports the reason.
+            # ``train`` reports why the photo cannot be read.
             continue
         small = downscale(picture.camera, _PHOTO_SIDE)
         size = (small.width, small.height)
         whole = np.rint(picture.colour * 255.0).astype(np.uint8)
-        # Blocks of whole pixels, as in the reduced camera: resizing the whole photo would be off by up to a pixel.
+        # Average blocks of whole pixels, as in the reduced camera; resizing the whole photo would shift it by up to a
+        # pixel.
         block = picture.camera.width // small.width
         used = np.ix_(range(block * small.height), range(block * small.width))
         photo = cv2.resize(whole[used], size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
@@ -65,9 +66,9 @@ def in_colours_of(reference: np.ndarray, photo: np.ndarray, shared: np.ndarray) 
     """(H, W, 3) float32: ``photo`` (H, W, 3) with the exposure and white balance of ``reference`` (H, W, 3), fitted to
     the pixels ``shared`` (H, W) bool.
 
-    Training against the photo must not change colours relative to Gaussians that are not trained. The three channels
-    are mixed linearly, by least squares over the three quarters of the pixels that agree best; with fewer than 100
-    shared pixels nothing changes.
+    Training against the photo must not change colours relative to Gaussians that are not trained. The conversion is a
+    linear mixing of the three channels, fitted by least squares to the three quarters of the pixels that agree best.
+    With fewer than 100 shared pixels, nothing changes.
     """
     if shared.sum() < 100:
         return photo
@@ -81,6 +82,6 @@ def in_colours_of(reference: np.ndarray, photo: np.ndarray, shared: np.ndarray) 
         residual = np.linalg.norm(rows @ mixing - target, axis=1)
         agreeing = residual <= np.quantile(residual, 0.75)
         chosen, rest = rows[agreeing], target[agreeing] - rows[agreeing] @ plain
-        # Where few colours leave the fit undetermined, the gain of each channel remains.
+        # Where too few colours determine the fit, the gain of each channel remains.
         mixing = plain + np.linalg.solve(chosen.T @ chosen + _REGULARIZATION * len(chosen) * np.eye(4), chosen.T @ rest)
     return np.clip(photo @ mixing[:3] + mixing[3], 0.0, 1.0).astype(np.float32)

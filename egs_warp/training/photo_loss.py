@@ -1,4 +1,4 @@
-"""Loss of a render against a photo, in the photo's exposure: L1 and SSIM with their gradient in five kernel launches.
+"""Loss of a render against a photo, at the photo's exposure: L1 and SSIM, and their gradient, in five kernel launches.
 
 The kernels are in ``egs_warp/kernels/training/photo_loss.py``.
 """
@@ -32,11 +32,11 @@ class Target:
     """A photo on the device of the training."""
 
     image: torch.Tensor
-    """(H, W, 3) float32."""
+    """(H, W, 3) float32, colours of the photo, 0 to 1."""
     alpha: torch.Tensor | None
     """(H, W) float32; if given, the photo is composited over the backdrop of the step."""
     weight: torch.Tensor | None
-    """(H, W) float32, weight of each pixel in L1; pixels of weight 0 do not count in SSIM either."""
+    """(H, W) float32, weight of each pixel in L1; pixels of weight 0 are excluded from SSIM, too."""
 
 
 class PhotoLoss:
@@ -168,7 +168,7 @@ class _Loss(torch.autograd.Function):
                 outputs=[at["by_toned"], of(by_colour), of(by_alpha, wp.float32)],
                 **options,
             )
-        # New tensors are made here, because the next call overwrites the buffers.
+        # Allocate new tensors here, because the next call overwrites the buffers.
         mixing = buffers["by_toned"].T @ buffers["front"]
         shift = buffers["by_toned"].T @ (alpha.reshape(-1, 1) if cut_out else torch.ones_like(buffers["off"][:, None]))
         by_tone = torch.cat([mixing, shift], dim=1)

@@ -26,7 +26,7 @@ class PhotoSources:
     """Origin of the photos of a training."""
 
     poses: str
-    """The file of poses, or the folder of the COLMAP model."""
+    """The file of poses, or the folder of a COLMAP model."""
     total: int
     """Number of photos in the file of poses."""
     used: int
@@ -86,7 +86,7 @@ def read_views(posed: Path | str, *, max_side: int | None = None, inverted_masks
         raise UserError(f"{posed}: none of its {len(left_out)} photos can be used; the first: {left_out[0].reason}")
     masked = sum(view.alpha is not None for view in views)
     if masked:
-        # If other photos have a cut-out, a photo with an opaque alpha channel is one that the object fills.
+        # If other photos are cut out by their alpha, the object fills a photo whose alpha channel is opaque everywhere.
         for number in opaque:
             image = views[number].image
             views[number] = replace(views[number], alpha=np.ones(image.shape[:2], np.float32))
@@ -111,7 +111,7 @@ def read_views(posed: Path | str, *, max_side: int | None = None, inverted_masks
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """Return ``path`` below the user's ``folder``, or in full."""
+    """Return ``path`` relative to the user's ``folder`` if it is inside; otherwise the full path."""
     return path.relative_to(folder).as_posix() if path != folder and path.is_relative_to(folder) else str(path)
 
 

@@ -1,7 +1,7 @@
 """Gaussians under training as a population: Adam's state follows them when they move and multiply.
 
-The relocation is that of Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". The kernels are
-in ``egs_warp/kernels/training/population.py``.
+The relocation follows Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". The kernels are in
+``egs_warp/kernels/training/population.py``.
 """
 
 from __future__ import annotations
@@ -26,21 +26,22 @@ _EVERY = 100
 _MIN_GROWTH = 1.05
 """Minimum factor by which the number of Gaussians grows at each relocation."""
 _GENTLE_GROWTH_END, _GROWTH_DEADLINE = 0.3, 0.5
-"""Fractions of the steps at which a given cap is reached: the first if growth stays gentle, the second in any case."""
+"""Fractions of the steps by which a given cap is reached: the first if the growth factor stays gentle, the second in
+any case."""
 _MAX_GENTLE_GROWTH = 1.1
-"""Growth factor above which copies are made faster than the photos can separate them."""
+"""Maximum gentle growth factor; above it, copies are created faster than the photos can separate them."""
 _REGULARIZATION = 0.01
-"""Weight of the mean opacity, and of the mean scale divided by the extent."""
+"""Weight of the penalties on the mean opacity and on the mean scale divided by the extent."""
 _JITTER = 5e5
 """Noise relative to the learning rate of the means."""
 _SETTLING_FROM, _FINAL_RATE = 0.5, 0.1
-"""Fraction of the steps from which the learning rates of all but the means decrease, and the fraction of the rate at
-the end."""
+"""Fraction of the steps from which all learning rates except the means' decrease, and the ratio of the final to the
+initial rate."""
 
 
 class Population:
-    """Parameter tensors with one Adam optimiser for all. ``relocate`` replaces tensors, so read ``tensors`` in each
-    step."""
+    """Parameter tensors and one Adam optimiser for all of them. ``relocate`` replaces tensors, so callers must read
+    ``tensors`` again in each step."""
 
     def __init__(
         self,
@@ -50,7 +51,7 @@ class Population:
         extent: float,
         generator: torch.Generator,
     ) -> None:
-        wp.init()  # Warp receives torch's tensors before any kernel is launched
+        wp.init()  # Warp receives torch's tensors before it launches any kernel
         self.tensors = tensors
         self._rates = {name: rates[name] * (extent if name == "means" else 1.0) for name in tensors}
         self._extent = extent
@@ -65,7 +66,7 @@ class Population:
     def step(self, *, done: float, settling: bool = False) -> None:
         """Take one step of Adam. The learning rate of the means falls to a hundredth as ``done`` goes from 0 to 1.
 
-        With ``settling`` the others fall to a tenth over the second half.
+        With ``settling`` the other rates fall to a tenth over the second half of the steps.
         """
         late = max(0.0, done - _SETTLING_FROM) / (1 - _SETTLING_FROM) if settling else 0.0
         for group in self._optimiser.param_groups:
@@ -75,7 +76,8 @@ class Population:
 
     @torch.no_grad()
     def add_regularization(self) -> None:
-        """Add the gradient of a penalty on opacities and scales: useless Gaussians fade, and can then be moved."""
+        """Add the gradient of a penalty on opacities and scales. It makes useless Gaussians fade, so that they can be
+        relocated."""
         opacities, scales = self.tensors["opacity_logits"], self.tensors["log_scales"]
         assert opacities.grad is not None and scales.grad is not None
         count = len(opacities)
@@ -101,7 +103,7 @@ class Population:
         while ``growth`` allows it.
         """
         self._jitter()
-        # In the last fifth of the steps the population is fixed.
+        # In the last fifth of the steps the number of Gaussians is fixed.
         if step % _EVERY != _EVERY - 1 or step > 0.8 * steps:
             return
         opacity = torch.sigmoid(self.tensors["opacity_logits"])
@@ -154,8 +156,7 @@ class Population:
         return torch.searchsorted(total, spots).clamp_max(len(weights) - 1)
 
     def _share(self, chosen: torch.Tensor) -> None:
-        """Set opacity and scale of each chosen Gaussian so that it and its copies together render like the single
-        one."""
+        """Set opacity and scale of each chosen Gaussian so that it and its copies together render like the original."""
         opacity = torch.sigmoid(self.tensors["opacity_logits"])
         copies = torch.bincount(chosen, minlength=len(opacity))
         unique = torch.nonzero(copies)[:, 0]
@@ -192,8 +193,8 @@ class Population:
             self.tensors[group["name"]] = new
 
     def _jitter(self) -> None:
-        """Add noise with each Gaussian's own shape to the means of faint ones, scaled as published for scenes of extent
-        1."""
+        """Add noise, shaped by each Gaussian's covariance, to the means of faint Gaussians. Its size is as published
+        for scenes of extent 1."""
         rate = next(group["lr"] for group in self._optimiser.param_groups if group["name"] == "means")
         means = self.tensors["means"]
         noise = torch.randn(means.shape, generator=self._generator, device=means.device)
@@ -209,7 +210,7 @@ class Population:
 
 
 def _growth_factor(ratio: float, step: int, steps: int) -> float:
-    """Return the growth factor at ``step`` of ``steps`` if the number is to grow by ``ratio`` in total."""
+    """Return the growth factor at ``step`` of ``steps`` that leads to growth by ``ratio`` in total."""
     best, last = (
         ratio ** (1 / max(1, round((share * steps - step) / _EVERY)))
         for share in (_GENTLE_GROWTH_END, _GROWTH_DEADLINE)

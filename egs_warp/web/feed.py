@@ -45,7 +45,7 @@ class LiveFeed:
         self._header: bytes | None = None
 
     def header(self) -> bytes:
-        """Return the header, the same bytes at every call."""
+        """Return the header; every call returns the same bytes."""
         if self._header is None:
             self._header = self._build_header()
         return self._header
@@ -56,7 +56,7 @@ class LiveFeed:
         body, mesh = creature.body, creature.cage.mesh
         facts = {
             "title": session.options.source,
-            # A page that reconnects to another session starts again.
+            # A page that reconnects to another session reloads itself.
             "session": self._name,
             "rate": FRAME_RATE,
             "frames": 0,
@@ -65,7 +65,7 @@ class LiveFeed:
             "friction": creature.geometry.friction,
             "front": creature.front.direction[:2].tolist(),
             "flat": len(creature.geometry.planes) == 1 and creature.geometry.field is None,
-            # The momentum residual is known only after a step; only takes contain its curve.
+            # The momentum residual is computed only after a step, so only takes contain its curve.
             "curves": curve_facts([curve for curve in CURVES if curve[0] != "residual"]),
             "audit": {},
             "motion": [],
@@ -100,7 +100,8 @@ class LiveFeed:
 
 
 def live_camera(creature: Creature, *, size: int = 512) -> Camera:
-    """Return the initial camera of the page, with the direction of the video's camera and space around the creature."""
+    """Return the initial camera of the page. It has the direction of the video's camera and leaves space around the
+    creature."""
     nodes, height = creature.start.positions, creature.body.height
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
     direction = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM) @ initial_stance(creature).ground.axes
@@ -118,7 +119,7 @@ def live_camera(creature: Creature, *, size: int = 512) -> Camera:
 
 
 def live_render_data(creature: Creature, splats: GaussianCloud, *, light: MainLight | None = None) -> RenderData:
-    """Return the data with which the page draws ``creature``; ``splats`` are its Gaussians, split at rest, and
+    """Return the data from which the page draws ``creature``. ``splats`` are its Gaussians at rest, after the splits;
     ``light`` is the main light in the axes of the capture."""
     placed = None if light is None else light.rotated(creature.frame.axes)
     feet = initial_stance(creature).feet()

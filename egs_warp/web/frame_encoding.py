@@ -11,7 +11,7 @@ from egs_warp.web.packets import Frame
 
 
 def encode_frame(index: int, state: BodyState, report: StepReport | None, creature: Creature) -> Frame:
-    """Build the frame of a state, with the curves ``recording.CURVES`` except the momentum residual.
+    """Build the frame of a state, with all curves of ``recording.CURVES`` except the momentum residual.
 
     Args:
         index: number of the frame.

@@ -1,4 +1,4 @@
-"""Idle states of a live body: relaxed after a fall, standing still, and its tilt."""
+"""States of an idle live body: relaxed after a fall, or standing still; and the tilt of a body."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class StillnessDetector:
 
 
 def tilt_degrees(place: Stance, positions: np.ndarray) -> float:
-    """Return the angle in degrees between the up axis of the body and that of its stance ``place``.
+    """Return the angle between the up axes of the body and of its stance ``place``, degrees.
 
     Args:
         place: upright stance.

@@ -46,7 +46,7 @@ class Mailbox:
         """Subscribe a page.
 
         Args:
-            wake: called from the thread of the session when ``take_news`` has something new.
+            wake: called from the thread of the session when ``take_news`` has new entries.
             first: returns the first frame to send.
         """
         with self._changed:

@@ -27,7 +27,7 @@ MAX_FRICTION = 2.0
 STYLE_NAMES = tuple(field.name for field in fields(Style) if field.name != "overlap")
 """Names of the style factors; a session keeps the overlap of its body."""
 _MOTIONS = re.compile(r"[A-Za-z0-9_=+\-., ]+")
-"""Characters allowed in the text of motions."""
+"""Pattern of the text of motions: its allowed characters."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class PlayScript:
     """Perform these motions next; they replace the queued motions."""
 
     script: Script
-    """The motions."""
+    """The motions to perform."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Steer:
     """Move at these speeds until the next command; this replaces the queued motions. Zero speeds stop the body."""
 
     command: Drive
-    """The speeds."""
+    """Requested speeds of the body."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class PushOnce:
 
 @dataclass(frozen=True)
 class Change:
-    """Change friction or stiffness; None leaves a value unchanged."""
+    """Change friction or stiffness; None leaves a property unchanged."""
 
     friction: float | None = None
     """Coulomb coefficient."""
@@ -91,10 +91,10 @@ class Change:
 
 @dataclass(frozen=True)
 class Restyle:
-    """Set the style of jumps from the next motion on."""
+    """Set the style of all later jumps."""
 
     style: Style
-    """The factors."""
+    """Factors of the style's parameters."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Pause:
     """Pause or continue the simulation."""
 
     on: bool
-    """True to pause."""
+    """True to pause, False to continue."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Record:
     """Start a take, or end and write it."""
 
     on: bool
-    """True to start."""
+    """True to start, False to end."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def _read_script(message: Mapping[str, Any], max_distance: float, node_count: in
     text = message.get("text")
     if not isinstance(text, str) or len(text) > MAX_TEXT_LENGTH:
         raise ValueError(f"text: give motions in at most {MAX_TEXT_LENGTH} characters, such as jump 0.5 0.2")
-    # Scripts and key frames are files of this machine, which a page must not read.
+    # Scripts and key frames would be files of this machine, which a page must not read.
     if not _MOTIONS.fullmatch(text) or re.search(r"\.(json|csv)", text, re.IGNORECASE):
         raise ValueError("text: give motions by name and number, such as hop x3, twist 90")
     script = motion(text)

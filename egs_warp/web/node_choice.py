@@ -12,20 +12,20 @@ from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.threads import one_blas_thread
 
 GPU_NODES = 500
-"""Number of nodes on a GPU, where a step takes less than 1 / 60 s (docs/benchmarks/step.md)."""
+"""Number of nodes on a GPU; a step with this number takes less than 1 / 60 s (docs/benchmarks/step.md)."""
 MIN_CHOSEN, MAX_CHOSEN = 120, 500
-"""Limits of the chosen number: limbs of most bodies need the smaller one, and ``animate`` uses the larger one."""
+"""Limits of the chosen number: the limbs of most bodies need at least the minimum, and ``animate`` uses the maximum."""
 _PROBE_TIME = 0.3
 """Duration of the speed measurement, s: long enough for other processes to take their usual share of the cores."""
 _MIN_SPEED = 0.5
 """Speed that the chosen number should reach, as a fraction of real time."""
 _PROBE_SIZE, _PROBE_COLUMNS = 300, 60
 _STEP_TIME_PER_PROBE = 20.5
-"""Mean time of a step of a jumping pawn with ``_STEP_NODES`` nodes, relative to one pass of the probe run at the same
-time (160 ms and 7.8 ms on two busy cores of a Xeon)."""
+"""Mean time of a step of a jumping pawn with ``_STEP_NODES`` nodes, relative to the time of one pass of the probe under
+the same load (160 ms and 7.8 ms on two busy cores of a Xeon)."""
 _STEP_NODES, _STEP_EXPONENT = 250, 0.54
-"""Requested number of nodes of that step, and the exponent with which the step time grows with it (97 ms and 7.0 ms
-with 120 nodes)."""
+"""Requested number of nodes in that measurement, and the exponent with which the step time grows with the number (97 ms
+and 7.0 ms were measured with 120 nodes)."""
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ def show(subject: SimulatedRun | Creature | Path | str) -> Any:
         subject: The result of ``simulate``, a creature, or the folder of a finished run.
 
     Returns:
-        An ``anywidget.AnyWidget``. Where no widgets are shown, a notebook shows a picture in its place.
+        An ``anywidget.AnyWidget``. If a notebook cannot show widgets, it shows a picture instead.
 
     Raises:
         UserError: anywidget is not installed, the player is not built, or the folder has no finished run.
@@ -65,7 +65,7 @@ def show(subject: SimulatedRun | Creature | Path | str) -> Any:
 
 
 def widget_module() -> str:
-    """Return the JavaScript module of the widget: the player, and a function that puts it into a cell.
+    """Return the JavaScript module of the widget: the player, and a function that adds it to a cell.
 
     Raises ``UserError`` if the player has not been built.
     """
@@ -73,7 +73,7 @@ def widget_module() -> str:
 
 
 def _picture(deformer: Deformer, run: Trajectory, frames: np.ndarray, camera: Camera) -> bytes:
-    """Return the frame in the middle as a PNG."""
+    """Return the middle one of the ``frames`` as a PNG."""
     (frame,) = drawn_frames(deformer, run, frames[[len(frames) // 2]], [camera], Shot())
     stream = io.BytesIO()
     Image.fromarray(frame.picture()).save(stream, "PNG")
@@ -100,7 +100,7 @@ def _widget_class() -> Any:
 
         def _repr_mimebundle_(self, **kwargs: Any) -> Any:
             data, metadata = super()._repr_mimebundle_(**kwargs)
-            # Where a notebook has no widgets, such as on a page that shows its saved file.
+            # Shown where a notebook has no widgets, such as on a page that displays its saved file.
             return data | {"image/png": base64.b64encode(self._picture).decode()}, metadata
 
     return PlayerWidget

@@ -1,4 +1,4 @@
-"""The page as one HTML file: as npm builds it, or with runs embedded."""
+"""The page as one HTML file: as built by npm, or with embedded runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egs_warp.web.recording import Recording
 PAGE = Path(__file__).with_name("page.html")
 """The page that npm builds."""
 _RUNS_MARKER = "<!-- runs -->"
-"""Text of the page that the runs replace."""
+"""Text of the page that is replaced by the runs."""
 
 
 def page_text() -> str:

@@ -52,7 +52,7 @@ class Job:
         return self._process.poll() is None
 
     def stop(self) -> None:
-        """End the command."""
+        """Signal the command to end, and wait for its end."""
         if not self.is_running:
             return
         self._process.terminate()

@@ -42,22 +42,22 @@ class Mark:
 
 @dataclass(frozen=True)
 class MovePlane:
-    """Put the ground of the active object here."""
+    """Move the ground of the active object to a plane."""
 
     plane: Plane
 
 
 @dataclass(frozen=True)
 class TurnFront:
-    """Let the active object face this way."""
+    """Set the front of the active object."""
 
     direction: np.ndarray
-    """(3,) unit vector."""
+    """(3,) unit vector of the front."""
 
 
 @dataclass(frozen=True)
 class AddObject:
-    """Begin another object."""
+    """Start another object."""
 
 
 @dataclass(frozen=True)
@@ -81,19 +81,19 @@ class RenameObject:
 
 @dataclass(frozen=True)
 class Undo:
-    """Undo the last change, or do it again."""
+    """Undo the last change, or redo it."""
 
     redo: bool = False
 
 
 @dataclass(frozen=True)
 class Save:
-    """Write the file."""
+    """Write the file of the picked objects."""
 
 
 @dataclass(frozen=True)
 class RunAnimate:
-    """Write the file and film the active object."""
+    """Write the file of the picked objects and film the active one."""
 
     motion: str
 
@@ -187,7 +187,7 @@ def _read_name(message: Mapping[str, Any]) -> RenameObject:
 
 
 def _read_animate(message: Mapping[str, Any]) -> RunAnimate:
-    # The motions of a live session have the same limits: a page must not name files of this machine.
+    # The motions have the same limits as in a live session: a page must not name files of this machine.
     read_message({"type": "motion", "text": message.get("motion")}, height=1.0, node_count=1)
     return RunAnimate(str(message["motion"]))
 

@@ -1,7 +1,7 @@
 """Session of the page of ``egs-warp pick``: a thread that applies the page's messages to the picked objects.
 
-All lengths are in the frame of the page, in which the capture is about one high; the file is written in the frame of
-the capture.
+All lengths are in the frame of the page, in which the capture has a height of about one. The file is written in the
+frame of the capture.
 """
 
 from __future__ import annotations
@@ -58,21 +58,22 @@ from egs_warp.web.pick_messages import (
 )
 
 _MEASURE_DELAY = 0.8
-"""Time without messages after which the active object is measured, s."""
+"""Time without messages before the active object is measured, s."""
 _NO_BODY: dict[str, Any] = {"type": "body", "rows": [], "motions": [], "front": None}
 """Event of an object without measurements."""
 _GRID_REACH, _GRID_STEP = 1.2, 2
-"""Half the side of the ground's grid for the page, in sizes of the object, and the number of measured nodes from one
-node of that grid to the next."""
+"""Half the side of the grid with which the page shows the ground, in sizes of the object; and the spacing of the grid's
+nodes, in nodes of the measured ground."""
 _MEASURE_NODES = 120
-"""Approximate number of cage nodes with which it is measured; feet and motions hardly depend on it."""
+"""Approximate number of cage nodes for these measurements; feet and motions hardly depend on it."""
 
 
 class PickCommands(Protocol):
-    """Arguments of the commands that a session starts; ``value`` selects a picked object, as for ``animate``."""
+    """Arguments of the commands that a session starts; ``value`` selects a picked object in the syntax of
+    ``animate``."""
 
     def animate(self, value: str, motion: str) -> tuple[list[str], Path]:
-        """Return the arguments of a film of ``motion``, and its folder."""
+        """Return the arguments that make a film of ``motion``, and the folder of the film."""
         ...
 
     def live(self, value: str) -> list[str]:
@@ -86,7 +87,7 @@ class PickCommands(Protocol):
 
 @dataclass(frozen=True)
 class PickSource:
-    """The capture of a session, in its own frame, and the commands that work on it."""
+    """The capture of a session, and the commands that work on it."""
 
     cloud: GaussianCloud
     """The capture, in its own frame."""
@@ -96,16 +97,17 @@ class PickSource:
     """Frame of the page in the capture."""
     name: str
     path: Path
-    """File to write."""
+    """File to which the picked objects are written."""
     commands: PickCommands
     first: Callable[[], Sequence[PickedObject]] = tuple
-    """Returns the objects to begin with, in the frame of the capture: of a file, or of the command line."""
+    """Returns the initial objects, in the frame of the capture: from a file or from the command line."""
     centre: np.ndarray | None = None
-    """(3,) point at which the cameras look, in the frame of the page."""
+    """(3,) point in the frame of the page at which its initial camera looks."""
     cameras: Sequence[Camera] = ()
-    """Cameras of the capture, in its own frame; empty if they are not known."""
+    """Cameras of the capture, in the capture's frame; empty if they are unknown."""
     film: str | None = None
-    """Motion of the film that is made after the page; None if the page starts ``commands``."""
+    """Motion of the film that the session's owner makes when the user requests it; None if the page starts
+    ``commands``."""
 
 
 class PickSession:
@@ -139,12 +141,12 @@ class PickSession:
         return self._history.state
 
     def start(self) -> None:
-        """Start the threads; the first one begins with a proposal."""
+        """Start the threads. The first action of the session is a proposal."""
         self._thread.start()
         self._measuring.start()
 
     def stop(self) -> None:
-        """End the thread and the commands that were started."""
+        """End the threads and the commands that were started."""
         with self._changed:
             self._is_stopping = True
             self._changed.notify_all()
@@ -179,7 +181,8 @@ class PickSession:
         return events
 
     def _send(self, event: dict[str, Any], *, lasting: bool = True) -> None:
-        """Queue an event; a ``lasting`` one replaces that of its type, and is repeated for a page that opens later."""
+        """Queue an event. A ``lasting`` event replaces the last one of its type, and is sent again to a page that opens
+        later."""
         with self._changed:
             if lasting:
                 self._events[event["type"]] = event
@@ -228,7 +231,7 @@ class PickSession:
         self._show()
 
     def apply(self, message: PickMessage) -> None:
-        """Apply one message. Raises ``UserError`` for what cannot be done."""
+        """Apply one message. Raises ``UserError`` if the message cannot be applied."""
         graph, state = self._graph, self.state
         assert graph is not None
         if isinstance(message, Mark):
@@ -296,7 +299,8 @@ class PickSession:
         self._send(self.pick_event())
 
     def pick_event(self) -> dict[str, Any]:
-        """Return the event ``pick``: the objects, the active one's ground and front, and what can be undone."""
+        """Return the event ``pick``: the objects, ground and front of the active one, and the changes that can be
+        undone."""
         state, graph = self.state, self._graph
         pick = state.pick
         size = 0.0
@@ -324,7 +328,7 @@ class PickSession:
             self._busy = text
             self._send({"type": "work", "text": text})
 
-    # Called from the thread of the measurements, which take longer than the next click.
+    # Called from the thread of the measurements, which take longer than the time between clicks.
 
     def _measure_loop(self) -> None:
         while True:
@@ -339,7 +343,7 @@ class PickSession:
             if pick.mask.any():
                 self._send({**_NO_BODY, "measuring": True})
             event = self._body_event(pick)
-            # Measurements of an earlier selection are out of date.
+            # Discard measurements of an earlier selection.
             if self.state.pick is pick:
                 self._send(event)
                 grid = self.ground_grid(pick)
@@ -372,8 +376,8 @@ class PickSession:
         }
 
     def ground_grid(self, pick: Pick) -> dict[str, Any] | None:
-        """Return the uneven ground about an object in the frame of the page, with the heights of nodes row by row; None
-        if it is flat or there is no ground to measure."""
+        """Return the uneven ground about an object in the frame of the page, with the heights of the grid's nodes row
+        by row; None if the ground is flat or cannot be measured."""
         source, frame = self.source, self.source.frame
         ground = ground_around(source.cloud, pick.mask, plane_in_capture(pick.plane, frame), source.cameras)
         if ground is None:
@@ -394,7 +398,7 @@ class PickSession:
         }
 
     def _motions(self, info: BodyInfo) -> list[dict[str, str | None]]:
-        """Return the motions that the page offers, and those that the object cannot do with the reason."""
+        """Return the motions that the page offers; motions that the object cannot perform have a reason."""
         if self.source.film is not None:
             return [{"name": self.source.film, "why": None}]
         return [{"name": n, "why": w} for n, w in info.motions().items() if MOTIONS[n].file is None]
@@ -457,7 +461,7 @@ class PickSession:
             self._send(event if address is None else {**event, "address": address})
 
         def ended(status: int, last: str) -> None:
-            # Exit status 3: the film is written, but is not what was requested.
+            # Exit status 3: the film is written, but the motion differs from the request.
             if folder is None or status not in (0, 3):
                 send(last, is_running=False, failed=status != 0)
                 return
@@ -481,6 +485,6 @@ class PickSession:
 
 
 def plane_in_capture(plane: Plane, frame: BodyFrame) -> Plane:
-    """Return a ``plane`` of the frame of the page in the frame of the capture."""
+    """Transform ``plane`` from the frame of the page to the frame of the capture."""
     normal = frame.axes.T @ plane.normal
     return Plane(normal, plane.offset / frame.scale - float(normal @ frame.origin))

@@ -1,4 +1,4 @@
-"""The player of bundles for other pages, as npm builds it (``egs_warp/web/player``)."""
+"""The player of bundles for other pages (``egs_warp/web/player``), as built by npm."""
 
 from __future__ import annotations
 

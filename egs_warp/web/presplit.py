@@ -1,7 +1,7 @@
 """Split the Gaussians of a live creature before it moves.
 
-The motion is not known in advance. The Gaussians are split for deformations along the softest modes of the body, which
-bend most in any motion.
+Because the motion is not known in advance, the Gaussians are split for deformations along the softest modes of the
+body. In any motion, the body bends most along these modes.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.pipelines.creature import Creature
 
 MODE_COUNT = 6
-"""Number of modes."""
+"""Number of modes for which the Gaussians are split."""
 MODE_AMPLITUDE = 0.3
 """Largest nodal displacement of a mode, body heights."""
 
 
 def presplit_gaussians(creature: Creature) -> GaussianCloud:
-    """Return the Gaussians of the creature at rest; those that the softest modes bend are split."""
+    """Return the Gaussians of the creature at rest, split where the softest modes bend them."""
     embedding = embed_gaussians(creature.cloud, creature.cage.mesh)
     return split_for_motion(creature.cloud, embedding, likely_poses(creature.body)).cloud
 

@@ -23,13 +23,13 @@ from egs_warp.web.recording import splat_arrays
 from egs_warp.web.server import FrameFeed
 
 _OUTLIERS = 0.5
-"""Percentage of the opaque Gaussians that are ignored at each end of an axis when the capture is measured."""
+"""Percentage of the opaque Gaussians that the bounds of the capture exclude at each end of an axis."""
 _OPAQUE = 0.3
-"""Opacity above which a Gaussian is used to measure the capture."""
+"""Minimum opacity of the Gaussians that define the bounds of the capture."""
 FOV_DEGREES = 30.0
 """Vertical field of view of the initial camera."""
 DISTANCE = 1.0 / np.tan(np.radians(0.5 * FOV_DEGREES))
-"""Distance of the camera at which half of the picture's height is one body height, body heights."""
+"""Distance of the camera, body heights, at which half of the picture's height shows one body height."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ def preview_of(
 def page_frame(
     cloud: GaussianCloud, *, up: np.ndarray | None = None, plane: Plane | None = None
 ) -> tuple[BodyFrame, np.ndarray]:
-    """Return a frame in which the capture stands upright and is one high, and the lower and the upper corner (2, 3) of
-    its bounds, without outliers.
+    """Return a frame in which the capture stands upright and has a height of one; and the bounds of the capture in that
+    frame, without outliers, as the lower and the upper corner (2, 3).
 
     Args:
         cloud: The capture.
@@ -80,7 +80,7 @@ def page_frame(
 
 
 def _bounds(frame: BodyFrame, points: np.ndarray) -> np.ndarray:
-    """Return the lower and the upper corner (2, 3) of the ``points`` (n, 3), without outliers, in ``frame``."""
+    """Return the bounds of ``points`` (n, 3), without outliers, in ``frame``: the lower and the upper corner (2, 3)."""
     return np.percentile(frame.points(points), [_OUTLIERS, 100.0 - _OUTLIERS], axis=0)
 
 
@@ -93,8 +93,8 @@ def camera_facts(bounds: np.ndarray, *, distance: float = DISTANCE) -> dict[str,
 
 
 def still_run(splats: GaussianCloud, bounds: np.ndarray, facts: Mapping[str, Any]) -> Preview:
-    """Return the Gaussians as a run of one frame, whose cage is one tetrahedron at a corner of the box ``bounds``
-    (2, 3). ``facts`` are entries of its header: at least title and camera."""
+    """Return the Gaussians as a run of one frame. Its cage is one tetrahedron at a corner of the box ``bounds`` (2, 3).
+    ``facts`` are entries of its header: at least title and camera."""
     low, high = bounds
     nodes = np.array([[(low, high)[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
     facts = {
@@ -155,11 +155,11 @@ class PreviewFeed:
         self._send({"type": "preparing", "stage": stage})
 
     def show_error(self, text: str) -> None:
-        """Show why there will be no creature."""
+        """Show why no creature will be available."""
         self._send({"type": "failed", "text": text})
 
     def start(self, session: FrameFeed) -> None:
-        """Send the frames of ``session`` from now on; a page that shows the preview reloads itself."""
+        """Send the frames of ``session`` from now on; a page that still shows the preview reloads itself."""
         self._session = session
         self._send({"type": "ready"})
 

@@ -34,7 +34,7 @@ class Recording(FinishedRun):
     """A finished run that is encoded as packets."""
 
     def header(self) -> bytes:
-        """Return the header: all data that are constant over the frames."""
+        """Return the header, which contains all data that are constant over the frames."""
         t, report = self.trajectory, self.report
         facts = {
             "title": self.title,
@@ -69,12 +69,12 @@ class Recording(FinishedRun):
             )
 
     def bytes(self) -> bytes:
-        """Return the header and all frames, as in a file."""
+        """Return the header and all frames in the format of a file."""
         return b"".join([self.header(), *(with_length(frame.packet()) for frame in self.frames())])
 
 
 def curve_facts(curves: Sequence[tuple[str, str, str]]) -> list[dict[str, str]]:
-    """Return ``curves`` in the form of the header."""
+    """Return ``curves`` in the format of the header."""
     return [{"name": name, "title": title, "unit": unit} for name, title, unit in curves]
 
 
@@ -92,13 +92,13 @@ def creature_header(
     """Return the header of a creature.
 
     Args:
-        facts: JSON values of the run; those of the muscles and the camera are added.
+        facts: JSON values of the run; the values of the muscles and the camera are added.
         render_data: Gaussians, muscles, feet and camera.
         mesh: cage at rest.
         node_mass: (N,) kg, mass of each node.
         planes: (P, 4) rows n, d of the ground planes.
         deformer: embedding of the Gaussians in the cage.
-        scene: background, without the shadow of the object if there is a main light; or None.
+        scene: background or None; if there is a main light, without the shadow of the object.
         more: further arrays by name.
     """
     camera = render_data.camera
@@ -156,7 +156,7 @@ def _edges(faces: np.ndarray) -> np.ndarray:
 def _arms(deformer: Deformer) -> np.ndarray:
     """Return (n', 15) float32: tetrahedra and inside fractions of the six axis ends, and three smoothing lengths.
 
-    There is one row for each of the n' Gaussians that extend over several tetrahedra, in their order.
+    There is one row for each of the n' Gaussians that extend over several tetrahedra, in the order of the Gaussians.
     """
     plan = deformer.plan
     rows = plan.mean_tets.numpy() < 0
@@ -167,8 +167,8 @@ def _arms(deformer: Deformer) -> np.ndarray:
 def splat_arrays(name: str, cloud: GaussianCloud) -> dict[str, np.ndarray]:
     """Return the arrays of ``cloud``, whose names begin with ``name``.
 
-    SH coefficients of degree 1 and above are bytes, 128 + 127 v / s, where s is the maximum of each coefficient over
-    all Gaussians.
+    SH coefficients v of degree 1 and above are stored as bytes 128 + 127 v / s, where s is the maximum magnitude of
+    that coefficient over all Gaussians and colours.
     """
     sh = cloud.sh.numpy()
     rest = sh[:, 1:]
@@ -208,6 +208,6 @@ def _curves(t: Trajectory) -> np.ndarray:
     per_step = np.stack(
         [np.linalg.norm(force, axis=1) / weight, used, np.linalg.norm(residual, axis=1) / weight], axis=1
     )
-    # The initial state has no step; it gets the values of the first step.
+    # No step leads to the initial state; it gets the values of the first step.
     padded = np.concatenate([per_step[:1] if steps else np.zeros((1, 3)), per_step])
     return np.stack([com @ up / t.height, padded[:, 0], padded[:, 1], t.min_gap / t.height, padded[:, 2]], axis=1)

@@ -27,7 +27,7 @@ from egs_warp.pipelines.report import GaussianCounts, report_of_run
 MAX_TAKE_SECONDS = 120.0
 """Seconds of simulated time after which a take ends."""
 SCRIPT = "script.json"
-"""File of a take that contains its motions."""
+"""File with the motions of a take."""
 
 
 def script_text(requests: Sequence[MotionRequest]) -> str:
@@ -75,7 +75,7 @@ class SessionRecording:
         return self.reports[-1].state.time - self.start.time if self.reports else 0.0
 
     def trajectory(self) -> Trajectory:
-        """Return the recorded steps; without any, the state at the start alone."""
+        """Return the recorded steps, or only the initial state if no step has been recorded."""
         return self._recorder.trajectory()
 
     def add(self, reports: Sequence[StepReport], *, kick: np.ndarray | None) -> None:
@@ -83,7 +83,7 @@ class SessionRecording:
 
         Args:
             reports: reports of the steps; more than one if a step was repeated with a smaller step size.
-            kick: (N, 3) m/s, velocities that pulls and pushes of the user added before the first step, or None.
+            kick: (N, 3) m/s, velocities that the user's pulls and pushes added before the first step, or None.
         """
         self.reports += reports
         self._recorder.add(reports, kick=kick)
@@ -104,7 +104,7 @@ class SessionRecording:
         Args:
             folder: parent folder.
             drawn_as: render data of the creature.
-            records: all motions of the session; those that start during the recording are written.
+            records: all motions of the session; only motions that start during the recording are written.
             requests: request of each motion.
             source: name of the capture, for the report.
             requested: options of the session, for the report.
@@ -142,7 +142,7 @@ class SessionRecording:
 
 
 def _next_folder(folder: Path) -> Path:
-    """Return the first ``take-N`` without a finished run."""
+    """Return the first ``take-N`` that does not contain a finished run."""
     number = 1
     while (folder / f"take-{number}" / MANIFEST).exists():
         number += 1

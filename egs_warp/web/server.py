@@ -1,6 +1,6 @@
-"""Local server of the page, its runs, and a socket that sends frames of a live session.
+"""Local server of the page, of its runs, and of a socket that sends frames of a live session.
 
-Only programs on this machine can connect, and only pages that this server has sent.
+Only programs on this machine can connect, and only pages from this server may use the socket.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ HOST = "127.0.0.1"
 MAX_MESSAGE_BYTES = 65_536
 """Maximum size of a message, bytes; a larger one closes the socket."""
 _HOST_NAMES = frozenset({"127.0.0.1", "localhost"})
-"""Host names that requests may use."""
+"""Host names that the server accepts in requests."""
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
@@ -111,7 +111,7 @@ class PageServer:
 
     @property
     def address(self) -> str:
-        """Address of the page; everyone who knows it can see the run."""
+        """Address of the page. It contains a secret, so only users who know the address can see the run."""
         query = "?live" if self._feed is not None else f"?runs={len(self._runs)}" if len(self._runs) > 1 else ""
         return f"http://{HOST}:{self.port}/{self.token}/{query}"
 
@@ -163,7 +163,8 @@ class PageServer:
 
 
 async def _first_to_end(*coroutines: Coroutine[None, None, None]) -> None:
-    """Run the coroutines until one ends, then cancel the others; raises the error of the one that ended."""
+    """Run the coroutines until one of them ends, then cancel the others. An error of the ended coroutine is raised
+    again."""
     tasks = [asyncio.create_task(coroutine) for coroutine in coroutines]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -184,7 +185,7 @@ async def _send_packets(page: WebSocket, feed: FrameFeed) -> None:
 
 
 async def _receive_messages(page: WebSocket, feed: FrameFeed) -> None:
-    """Pass the messages of the page to ``feed``; answer an invalid one with an error."""
+    """Pass the messages of the page to ``feed``; answer an invalid message with an error."""
     while True:
         try:
             message = json.loads(await page.receive_text())
@@ -192,7 +193,7 @@ async def _receive_messages(page: WebSocket, feed: FrameFeed) -> None:
                 raise ValueError("not an object")
             feed.receive(message)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            # Answer in one line and continue.
+            # Report the error in one line and continue.
             await page.send_text(json.dumps({"error": f"invalid message: {str(error)[:200]}"}))
 
 

@@ -1,7 +1,7 @@
 """Live session: a thread that simulates a creature and handles the messages of its page.
 
-If a step takes less time than it covers, the thread waits for the clock; otherwise the simulation is slower than real
-time. Nothing is simulated while no page is subscribed.
+If a step takes less time than the simulated time that it covers, the thread waits for the clock; otherwise the
+simulation is slower than real time. No steps are computed while no page is subscribed.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class Session:
     def subscribe(self, wake: Callable[[], object]) -> None:
         """Subscribe a page and continue the simulation.
 
-        ``wake`` is called from the thread of the session when ``take_news`` has something new. The first news is the
+        ``wake`` is called from the thread of the session when ``take_news`` has new entries. The first entry is the
         current frame.
         """
         self._mailbox.subscribe(wake, self._frame)
@@ -160,7 +160,7 @@ class Session:
         self._mailbox.wait_until(lambda: self._due - time.perf_counter())
 
     def advance(self) -> None:
-        """Compute one step and send its frame. If the step fails, put the body back at its start."""
+        """Compute one step and send its frame. If the step fails, reset the body to its start."""
         self._single_steps = max(self._single_steps - 1, 0)
         before = self.state
         try:
@@ -171,7 +171,7 @@ class Session:
             self.state, self._memory, reports = stepper.advance(start, self._memory, objectives, self._dt)
             if not np.isfinite(self.state.positions).all():
                 raise FloatingPointError("positions are not finite")
-        # A failing step must not end the session.
+        # An error in a step must not end the session.
         except Exception as error:
             print(f"egs-warp: live: {type(error).__name__}: {error}", file=sys.stderr)
             self._mailbox.send_line("the solver failed; the creature is back at its start")
@@ -193,7 +193,7 @@ class Session:
         for message in self._mailbox.take_requests():
             try:
                 self._do(message)
-            # A failing message must not end the session.
+            # An error in a message must not end the session.
             except Exception as error:
                 print(f"egs-warp: live: {type(error).__name__}: {error}", file=sys.stderr)
                 self._mailbox.send_line(f"the command failed: {str(error)[:200]}")
@@ -232,7 +232,7 @@ class Session:
                 self._mailbox.send({"type": "script", "text": script_text(requests), "motions": len(requests)})
 
     def _stand_up(self) -> None:
-        """Put the body back upright at its start."""
+        """Reset the body to its upright start."""
         self._end_take()
         self._user_forces.clear()
         self._stillness.reset()

@@ -1,4 +1,4 @@
-"""Schedule the motions of a live creature: requested motions, navigation to a point, driving, or standing.
+"""Schedules the motions of a live creature: requested motions, navigation to a point, driving, or standing.
 
 A motion that has started is completed. A new request replaces the queued motions and starts as soon as the body is at
 rest.
@@ -43,11 +43,11 @@ _MAX_JUMP_DISTANCE, _JUMP_HEIGHT = 0.5, 0.2
 _MAX_WALK_DISTANCE = 0.8
 """Maximum length of a walk before the next one is planned, body heights."""
 _MAX_FAILED_LEGS = 3
-"""Number of consecutive legs without progress after which navigation stops."""
+"""Maximum number of consecutive legs without progress; then navigation stops."""
 FALLEN_TILT = 60.0
-"""Tilt from upright beyond which a body counts as fallen, degrees."""
+"""Minimum tilt from upright, degrees, of a fallen body."""
 _FALL_TIME = 1.0
-"""Time for which a body must be tilted to count as fallen, sqrt(H / g)."""
+"""Minimum time for which a fallen body has had that tilt, sqrt(H / g)."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Task:
     """A queued motion and its request."""
 
     part: MotionTask
-    """The motion."""
+    """The motion to perform."""
     request: MotionRequest
     """The request, for a script."""
 
@@ -101,7 +101,8 @@ def tasks_of(script: Script, height: float) -> list[Task]:
 
 
 class PointNavigation:
-    """Navigation to a point by walking, or by turns and jumps. Each leg is planned from the end of the last one."""
+    """Navigation to a point by walking, or by turns and jumps. Each leg is planned from the position that the last one
+    reached."""
 
     def __init__(self, goal: np.ndarray, *, walks: bool) -> None:
         """Navigate to ``goal`` (2,) m; ``walks`` is True if the body can walk."""
@@ -144,7 +145,7 @@ class PointNavigation:
 
 
 class MotionScheduler:
-    """Motion that runs the requested motions of a body one after the other."""
+    """Motion that performs the requested motions of a body one after the other."""
 
     def __init__(self, place: Stance, send_line: Callable[[str], object]) -> None:
         """Stand at ``place``; ``send_line`` sends one line of text to the user."""
@@ -173,17 +174,17 @@ class MotionScheduler:
         self._tilted_since: float | None = None
 
     def perform(self, script: Script) -> None:
-        """Queue the motions of ``script`` in place of the queued ones."""
+        """Queue the motions of ``script``; they replace the queued ones."""
         self.cancel()
         self._tasks.extend(tasks_of(script, self.place.body.height))
 
     def go(self, goal: np.ndarray) -> None:
-        """Go to ``goal`` (2,) m next, in place of the queued motions."""
+        """Go to ``goal`` (2,) m next; this replaces the queued motions."""
         self.cancel()
         self._journey = PointNavigation(goal, walks=self.walks)
 
     def drive(self, command: Drive) -> None:
-        """Move at the speeds of ``command`` after the active motion, until the next request."""
+        """Move at the speeds of ``command`` after the active motion ends, until the next request."""
         self.cancel()
         self._drive = command
 
@@ -224,7 +225,7 @@ class MotionScheduler:
         return forward / max(float(np.linalg.norm(forward)), 1e-12)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the active motion, after starting the next motion if that is due.
+        """Start the next motion if it is due, and return the objectives of the active motion.
 
         Args:
             state: state at the start of the step.
@@ -254,7 +255,8 @@ class MotionScheduler:
         self.cancel()
 
     def _begin_next(self, state: BodyState, report: StepReport | None) -> None:
-        """Start the next motion: a queued one, a leg of the navigation, driving or, without any of these, standing."""
+        """Start the next motion: a queued motion, a leg of the navigation, driving or, if there is none of these,
+        standing."""
         place = replace(self.place.next_stance(state.positions, report), style=self.style)
         if self._is_ball:
             self.place = place
@@ -280,7 +282,7 @@ class MotionScheduler:
         self.requests.append(replace(task.request, style=self.style) if has_style else task.request)
 
     def _begin_drive(self, place: Stance, time: float) -> bool:
-        """Start driving; return False, after a line to the user, if the body cannot be driven."""
+        """Start driving; if the body cannot be driven, send a line to the user and return False."""
         try:
             drive = LiveDrive(place)
         except UserError as error:

@@ -1,4 +1,4 @@
-"""Forces of the user on a body: a pull that lasts until it is released, and pushes in the next step."""
+"""Forces of the user on a body: a pull that lasts until it is released, and pushes that act in the next step."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class UserForces:
         self._spring.target = np.array(request.target)
 
     def release(self) -> None:
-        """End the pull."""
+        """End the user's pull."""
         self._spring = None
 
     def push(self, request: PushOnce) -> None:
-        """Push in the next step."""
+        """Add a push that acts in the next step."""
         self._pushes.append(request)
 
     def clear(self) -> None:

@@ -37,7 +37,7 @@ def bake_light_kernel(
     """Compute the light at each point.
 
     Args:
-        reach: length of the ambient rays, and the distance over which the object above darkens the ground.
+        reach: length of the ambient rays, and the distance over which the object above darkens the ground, scene units.
         light_softness: tangent of the half-angle of the key light's disc.
         sky_out: cosine-weighted fraction of the hemisphere in which the sky is visible.
         ground_out: cosine-weighted fraction of the hemisphere in which lit ground is visible.
@@ -48,7 +48,7 @@ def bake_light_kernel(
     helper = wp.where(wp.abs(n[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
     t = wp.normalize(wp.cross(helper, n))
     b = wp.cross(n, t)
-    # Offset from the triangles, which cut the corners of creases.
+    # Start above the triangles, which cut the corners of creases.
     start = points[i] + n * (reach * 0.018)
     height = wp.dot(points[i], up) - ground_height
     turn = float(i) * 1.7

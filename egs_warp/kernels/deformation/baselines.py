@@ -17,7 +17,8 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def interpolated(corners: wp.vec4i, weights: Vec4, positions: wp.array[Vec3]) -> Vec3:
-    """Return the point with barycentric ``weights``, the inverse of Eq. (2)."""
+    """Return the point with the barycentric ``weights`` on the tetrahedron of the nodes ``corners``; the inverse of Eq.
+    (2)."""
     return (
         weights[0] * positions[corners[0]]
         + weights[1] * positions[corners[1]]
@@ -89,8 +90,8 @@ def deform_with_tetrahedron_kernel(
     log_scales_out: wp.array[wp.vec3],
     polar_rotations_out: wp.array[wp.vec4],
 ):
-    """Deform each Gaussian by the F of its own tetrahedron, whose corners the cage has deformed (VR-GS, two-level
-    embedding)."""
+    """Deform each Gaussian by the gradient F of its own tetrahedron, whose corners the cage has deformed (VR-GS,
+    two-level embedding)."""
     row = first_row + wp.tid()
     lengths = local_lengths(log_scales[row], reach, min_length)
     centre = Vec3()
@@ -125,7 +126,7 @@ def deform_with_gradient_kernel(
     log_scales_out: wp.array[wp.vec3],
     polar_rotations_out: wp.array[wp.vec4],
 ):
-    """Deform each Gaussian by one F, that of the tetrahedron that contains the mean (PhysGaussian)."""
+    """Deform each Gaussian by the gradient F of the tetrahedron that contains its mean (PhysGaussian)."""
     row = first_row + wp.tid()
     axes = rotation_from_quaternion(rotations[row])
     means_out[row] = single(interpolated(nodes[row], weights[row], positions))
@@ -137,7 +138,7 @@ def deform_with_gradient_kernel(
 
 @wp.func
 def triangle_frame(a: Vec3, b: Vec3, c: Vec3) -> Mat33:
-    """Return the matrix of two edges and the unit normal of a triangle."""
+    """Return the matrix whose columns are two edges and the unit normal of a triangle."""
     return wp.matrix_from_cols(b - a, c - a, wp.normalize(wp.cross(b - a, c - a)))
 
 
@@ -158,8 +159,8 @@ def deform_with_surface_kernel(
     log_scales_out: wp.array[wp.vec3],
     polar_rotations_out: wp.array[wp.vec4],
 ):
-    """Deform each Gaussian by the F of the nearest surface triangle, which does not stretch along the triangle's normal
-    (SuGaR: Gaussians bound to triangles)."""
+    """Deform each Gaussian by the gradient F of the nearest surface triangle; F does not stretch along the triangle's
+    normal (SuGaR: Gaussians bound to triangles)."""
     row = first_row + wp.tid()
     f = faces[face_from_gaussian[row]]
     before = triangle_frame(rest[f[0]], rest[f[1]], rest[f[2]])

@@ -58,9 +58,9 @@ class CageMaps:
     """Affine map x0' + F (x - x0) of each tetrahedron, and the rotation of F."""
 
     maps: wp.array[wp.vec4]
-    """(3 T,) rows of F, each followed by one coordinate of x0'. Most arms read only this."""
+    """(3 T,) rows of F, each followed by one coordinate of x0'. Most arms read only this array."""
     frames: wp.array[wp.vec4]
-    """(2 T,) x0 in the first row of each tetrahedron, R_polar as a quaternion w, x, y, z in the second."""
+    """(2 T,) two rows for each tetrahedron: x0, then R_polar as a quaternion w, x, y, z."""
 
 
 @wp.kernel
@@ -122,8 +122,7 @@ def image(map: Affine, point: wp.vec3) -> wp.vec3:
 
 
 RIGID = wp.constant(wp.float32(3.0))
-"""Value of ``inside_fractions[0]`` that marks a Gaussian far outside the cage, which is moved rigidly and not
-stretched."""
+"""Value of ``inside_fractions[0]`` for a Gaussian far outside the cage, which is moved rigidly and not stretched."""
 
 
 SixTets = wp.types.vector(length=6, dtype=wp.int32)
@@ -137,26 +136,27 @@ def exponential(v: wp.vec3) -> wp.vec3:
 
 @wp.func
 def reach_of(arms: wp.array2d[wp.float32], row: wp.int32, axis: wp.int32, scale: wp.float32) -> wp.float32:
-    """Return the distance between the two ends of an axis, at least three standard deviations. Gradients jump between
-    tetrahedra; over a much shortened arm such a jump would not approximate a derivative."""
+    """Return the distance between the two ends of an axis, but at least three standard deviations. Gradients jump
+    between tetrahedra; over much shortened arms, a difference quotient of such a jump would not approximate a
+    derivative."""
     return wp.max(arms[row, axis] + arms[row, 3 + axis], 3.0 * scale)
 
 
 @wp.struct
 class ArmPlan:
-    """Frame-independent input of ``deform_arms`` for n Gaussians. The arrays have one value per Gaussian in their last
-    dimension, for contiguous access by neighbouring threads."""
+    """Frame-independent input of ``deform_arms`` for n Gaussians. The last dimension of each array is the Gaussian, so
+    that neighbouring threads access memory contiguously."""
 
     mean_tets: wp.array[wp.int32]
-    """(n,) tetrahedron of the mean t, or -1 - t for a Gaussian that needs more than the map of that tetrahedron."""
+    """(n,) tetrahedron t of the mean, or -1 - t for a Gaussian that needs more than the map of that tetrahedron."""
     end_tets: wp.array2d[wp.int32]
     """(6, n) tetrahedron of each arm's end."""
     inside_fractions: wp.array2d[wp.float32]
     """(6, n) fraction of each arm inside the tetrahedron of the mean. A negative value is minus the length of a longer
-    arm that ends in another tetrahedron; the deformed arm is then computed from its deformed end and the deformed
-    mean."""
+    arm that ends in another tetrahedron; the deformed arm is then the difference between its deformed end and the
+    deformed mean."""
     smoothing_lengths: wp.array2d[wp.float32]
-    """(3, n) m, s_k^2 divided by the reach of both arms."""
+    """(3, n) m, s_k^2 divided by the distance between the two ends of axis k (``reach_of``)."""
 
 
 @wp.kernel
@@ -176,7 +176,7 @@ def plan_arms_kernel(
 ):
     """Precompute ``ArmPlan``.
 
-    The motion is continuous and linear in each tetrahedron. So an arm that crosses a face from the tetrahedron of the
+    The motion is continuous, and affine in each tetrahedron. So an arm that crosses a face from the tetrahedron of the
     mean (gradient F) into the next one (gradient G) is deformed to (u F + (1 - u) G) r per unit length, where u is the
     fraction of the arm before the face. This avoids a difference of positions, which for a tiny arm would be mostly
     rounding error. A longer arm that ends in another tetrahedron gets a negative fraction.
@@ -240,10 +240,10 @@ def deform_arm(
     cage: CageMaps,
 ) -> wp.vec3:
     """Return the deformed arm along ``axis``, per unit length: a column of D_s D_m^-1 R (Eq. 14). ``through`` is F
-    axis.
+    times the ``axis``.
 
     An arm that bridges a gap between two limbs can be stretched far more than the material at either end, which would
-    show as a spike. So its length is limited to ``max_stretch`` times the larger stretch at its two ends.
+    appear as a spike. So its length is limited to ``max_stretch`` times the larger stretch at its two ends.
     """
     if tet == mean_tet:
         return through
@@ -261,12 +261,12 @@ def deform_arm(
 
 @wp.struct
 class DeformedArms:
-    """Columns of F+ R and F- R, and the deformed mean."""
+    """F+ R and F- R by columns, and the deformed mean."""
 
     plus: wp.mat33
     minus: wp.mat33
     through: wp.mat33
-    """F R of the tetrahedron of the mean."""
+    """F R, where F is the gradient of the tetrahedron of the mean."""
     mean: wp.vec3
     tet: wp.int32
     """Tetrahedron of the mean."""
@@ -287,7 +287,7 @@ def deform_arms(
     ends = SixTets()
     shares = SixShares()
     if result.straddles:
-        # Issue all loads first: on a GPU, dependent loads take most of the time.
+        # Issue all loads first: on a GPU, dependent loads would dominate the time.
         for k in range(6):
             ends[k] = plan.end_tets[k, gaussian]
             shares[k] = plan.inside_fractions[k, gaussian]
@@ -298,7 +298,7 @@ def deform_arms(
     result.through = around.gradient * axes
     result.plus = result.through
     result.minus = result.through
-    # Most Gaussians are small and lie in one tetrahedron; F+ and F- are then its gradient.
+    # Most Gaussians are small and lie in one tetrahedron; F+ and F- are then the gradient F of that tetrahedron.
     if result.straddles:
         t = result.tet
         m = result.mean

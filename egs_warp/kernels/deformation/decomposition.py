@@ -18,8 +18,8 @@ def rotation_from_quaternion(q: wp.vec4) -> wp.mat33:
 
 @wp.func
 def quaternion_from_rotation(m: wp.mat33) -> wp.vec4:
-    """Return the quaternion w, x, y, z of a rotation matrix, computed from its largest component. Branches replace a
-    variable index, which would move the matrix to local memory."""
+    """Return the quaternion w, x, y, z of a rotation matrix, computed from its largest component. It is selected by
+    branches, because a variable index would move the matrix to local memory."""
     xx = m[0, 0]
     yy = m[1, 1]
     zz = m[2, 2]
@@ -41,7 +41,8 @@ def column(m: wp.mat33, k: wp.int32) -> wp.vec3:
 
 @wp.struct
 class Pair:
-    """Two columns of a 3x3 matrix, and of the rotation that has been applied to it from the right."""
+    """Two columns of a 3x3 matrix, and two columns of the rotation that has been applied to the matrix from the
+    right."""
 
     a: wp.vec3
     b: wp.vec3
@@ -75,7 +76,7 @@ def orthogonal_pair(a: wp.vec3, b: wp.vec3, va: wp.vec3, vb: wp.vec3) -> Pair:
 
 @wp.struct
 class Columns:
-    """3x3 matrix by columns, and the rotation that has been applied to it from the right."""
+    """3x3 matrix by columns, and the rotation by columns that has been applied to it from the right."""
 
     a: wp.vec3
     b: wp.vec3
@@ -90,8 +91,8 @@ def orthogonal_columns(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> Columns:
     """Return M V with orthogonal columns (left singular vectors times singular values), and V with det V = +1, by
     one-sided Jacobi.
 
-    Each column keeps its own relative precision, so float32 is enough for splats whose scales differ by e^10, and each
-    column stays as close as possible to its original direction.
+    Each column retains its own relative precision, so float32 is sufficient for splats whose scales differ by a factor
+    of e^10, and each column stays as close as possible to its original direction.
     """
     m = Columns()
     m.a = a
@@ -151,10 +152,10 @@ def unit_pair(a: wp.vec3, b: wp.vec3) -> wp.mat33:
 
 @wp.func
 def proper_frame(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
-    """Return unit columns along orthogonal ones; the shortest is the cross product of the others, so that det = +1
-    always.
+    """Return unit columns along three orthogonal columns; the shortest is replaced by the cross product of the other
+    two, so that det = +1 always.
 
-    The other two are selected by comparison instead of branches, which would diverge on a GPU.
+    The longer two are selected by comparison instead of branches, which would diverge on a GPU.
     """
     aa = wp.length_sq(a)
     bb = wp.length_sq(b)
@@ -182,7 +183,8 @@ def rotation_part(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
 
 @wp.func
 def match_columns(frame: wp.mat33, reference: wp.mat33) -> wp.vec3i:
-    """Return the column of ``frame`` for each column of ``reference``: the permutation of greatest total alignment."""
+    """Return the index of the column of ``frame`` for each column of ``reference``: the permutation of greatest total
+    alignment."""
     d = wp.transpose(reference) * frame
     best = wp.vec3i(0, 1, 2)
     best_total = wp.abs(d[0, 0]) + wp.abs(d[1, 1]) + wp.abs(d[2, 2])
@@ -210,8 +212,8 @@ def match_columns(frame: wp.mat33, reference: wp.mat33) -> wp.vec3i:
 
 @wp.func
 def rotation_of(m: wp.mat33) -> wp.mat33:
-    """Return the ``rotation_part`` of a matrix with det > 0, by Newton's iteration X <- (g X + X^-T / g) / 2 (Higham
-    1986), which takes half the work, where it is safe."""
+    """Return the ``rotation_part`` of a matrix with det > 0. Where it is safe, Newton's iteration X <- (g X + X^-T / g)
+    / 2 (Higham 1986) is used, which takes half the work."""
     a = column(m, 0)
     b = column(m, 1)
     c = column(m, 2)
@@ -244,14 +246,14 @@ def rotation_of(m: wp.mat33) -> wp.mat33:
 
 @wp.func
 def select_column(m: wp.mat33, k: wp.int32) -> wp.vec3:
-    """Return column k, selected by comparison: a variable index would move the matrix to local memory."""
+    """Return column k, selected by comparison, because a variable index would move the matrix to local memory."""
     return wp.where(k == 0, column(m, 0), wp.where(k == 1, column(m, 1), column(m, 2)))
 
 
 @wp.func
 def align_signs(frame: wp.mat33, order: wp.vec3i, reference: wp.mat33) -> wp.mat33:
-    """Return the columns of ``frame`` in that order, with the signs of ``reference``; the least aligned one is flipped
-    if needed for det = +1."""
+    """Return the columns of ``frame`` in the given ``order``, with the signs of ``reference``. If needed for det = +1,
+    the sign of the least aligned column is flipped."""
     a = select_column(frame, order[0])
     b = select_column(frame, order[1])
     c = select_column(frame, order[2])

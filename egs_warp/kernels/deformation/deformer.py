@@ -1,4 +1,4 @@
-"""Deform Gaussians with the cage (Eq. 14, 15) and measure how much each is bent (Eq. 16)."""
+"""Deform Gaussians with the cage (Eq. 14, 15) and measure how much the motion bends each (Eq. 16)."""
 
 import warp as wp
 
@@ -41,8 +41,8 @@ class DeformedShape:
 
 @wp.func
 def deform_shape(stretched: wp.mat33, scales: wp.vec3, reference: wp.mat33) -> DeformedShape:
-    """Compute Eq. (15) for ``stretched`` = F R: the SVD of F R S, its axes matched in order and sign to R_polar r_i
-    (``reference``)."""
+    """Compute Eq. (15) for ``stretched`` = F R: the SVD of F R S, with the axes matched in order and sign to the axes
+    R_polar r_i (``reference``)."""
     factor = scaled_columns(stretched, scales)
     m = orthogonal_columns(column(factor, 0), column(factor, 1), column(factor, 2))
     frame = proper_frame(m.a, m.b, m.c)
@@ -97,9 +97,8 @@ def deform_gaussian(
     """Deform a Gaussian by F = (F+ + F-)/2 (Eq. 14), or by the F of the mean's tetrahedron where det F <= 0, and apply
     Eq. (15).
 
-    The mean follows the mean of the Gaussian's mass to second order (beyond the paper, which deforms the mean as a
-    point): E[x(m + sum z_k s_k r_k)] = x(m) + sum s_k^2 x_kk / 2, where x_kk is estimated from the difference of the
-    two arms.
+    The deformed mean is the mean of the Gaussian's mass to second order, E[x(m + sum z_k s_k r_k)] = x(m) + sum s_k^2
+    x_kk / 2, where x_kk is estimated from the difference of the two arms. The paper deforms the mean as a point.
     """
     axes = rotation_from_quaternion(rotation)
     scales = exponential(log_scales)
@@ -171,10 +170,10 @@ def angle_between(a: wp.vec3, b: wp.vec3) -> wp.float32:
 
 @wp.func
 def bend_frame(side: wp.mat33, scales: wp.vec3) -> wp.mat33:
-    """Return an eigenframe of Sigma'+- that stays defined where scales are equal: the rotation part of [F R] S^2.
+    """Return an eigenframe of Sigma'+- that is well defined where scales are equal: the rotation part of [F R] S^2.
 
-    It differs from the eigenframe by terms of order (s_j/s_i)^2 where s_i >> s_j, follows the long axes and not the
-    short ones, and, unlike eigenvectors, is not arbitrary in the plane of a round disc.
+    It differs from the exact eigenframe by terms of order (s_j/s_i)^2 where s_i >> s_j, and it follows the long axes
+    rather than the short ones. Unlike eigenvectors, it is not arbitrary in the plane of a round disc.
     """
     longest = wp.max(scales)
     relative = scales / longest
@@ -201,8 +200,8 @@ def measure_bend_kernel(
     """Update the maximum of each measure: the angle of Eq. (16) and, along each axis, the deviation of the motion from
     an affine map.
 
-    With arms reaching L on both sides of axis k, the second derivative of the motion along axes k and j is about (F_k+
-    - F_k-) r_j / 2L. ``curl`` is the angle between the two vectors F_k+- r_j, the largest over j. ``error`` is the
+    With arms of length L on both sides of axis k, the second derivative of the motion along axes k and j is about (F_k+
+    - F_k-) r_j / 2L. ``curl`` is the maximum over j of the angle between the two vectors F_k+- r_j. ``error`` is the
     displacement that F does not represent at one standard deviation along both axes.
     """
     row = first_row + wp.tid()
@@ -224,15 +223,15 @@ def measure_bend_kernel(
         f_minus = affine_of(cage, plan.end_tets[3 + k, row]).gradient * axes
         reach = reach_of(arms, row, k, scales[k])
         for j in range(3):
-            # Along the axis the positions of the ends are known; across it only their gradients are.
+            # Along axis k the positions of the ends are known; across it only the gradients at the ends are.
             a = wp.where(j == k, column(both.plus, k), column(f_plus, j))
             b = wp.where(j == k, column(both.minus, k), column(f_minus, j))
             axis_error = scales[k] * scales[j] * wp.length(a - b) / reach
             angle = wp.degrees(angle_between(a, b))
-            # The mixed derivative is symmetric; the longer baseline measures it better.
+            # The mixed derivative is symmetric; measure it over the longer baseline.
             if scales[j] > scales[k]:
                 axis_error = 0.0
-            # Ignore an axis that is too short to be visible.
+            # Ignore axes that are too short to be visible.
             if axis_error > 0.25 * error[k]:
                 curl[k] = wp.max(curl[k], angle)
             error[k] = wp.max(error[k], axis_error)

@@ -1,4 +1,4 @@
-"""Locate points in a rest cage (Eq. 2) and lay out the seven points of every Gaussian (Eq. 3)."""
+"""Kernels that locate points in a rest cage (Eq. 2) and compute the seven points of every Gaussian (Eq. 3)."""
 
 import warp as wp
 
@@ -6,7 +6,7 @@ from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
 
-# A point on a shared face belongs to both tetrahedra; rounding must not decide which.
+# A point on a shared face belongs to both tetrahedra; the tolerance makes the choice independent of rounding.
 INSIDE_TOLERANCE = wp.constant(wp.float64(1.0e-10))
 DISTANCE_TOLERANCE = wp.constant(wp.float64(1.0e-9))
 
@@ -64,8 +64,8 @@ def closest_on_triangle(a: Vec3, b: Vec3, c: Vec3, point: Vec3) -> Vec3:
 
 @wp.func
 def distance_to_tet(x0: Vec3, x1: Vec3, x2: Vec3, x3: Vec3, weights: Vec4, point: Vec3) -> real:
-    """Return the distance between a tetrahedron and a point outside it; only faces with the point on their outer side
-    can be nearest."""
+    """Return the distance between a tetrahedron and a point outside it. Only faces whose outer side faces the point can
+    be nearest."""
     nearest = real(1.0e300)
     if weights[0] < real(0.0):
         nearest = wp.min(nearest, wp.length(point - closest_on_triangle(x1, x2, x3, point)))
@@ -105,7 +105,8 @@ def locate(
     0.
 
     Among several tetrahedra that contain the point, the lowest index is returned. Among several at equal distance (the
-    point faces a shared edge or node), the one whose weights extrapolate least, then the lowest index.
+    nearest point is on a shared edge or node), the one whose weights extrapolate least is returned, then the lowest
+    index.
     """
     coarse = single(point)
 
@@ -120,7 +121,7 @@ def locate(
     if best >= 0:
         return wp.vec2i(best, 1)
 
-    # The float32 distance to the surface bounds the search; slack covers its rounding.
+    # The float32 distance to the surface bounds the search; ``slack`` covers its rounding error.
     slack = 1.0e-5 * (wp.length(coarse) + wp.float32(extent))
     radius = wp.length(coarse) + 2.0 * wp.float32(extent)
     on_surface = wp.mesh_query_point_no_sign(surface, coarse, radius)
@@ -237,8 +238,8 @@ def embed_gaussians_kernel(
 ):
     """Embed the seven points of each Gaussian: the mean, three ends m + arm r_j, three ends m - arm r_j (Eq. 3).
 
-    Point k of Gaussian i is row 7 i + k. An arm whose end would need weights outside [-1, 2] is shortened until it does
-    not. If no length suffices (the mean itself lies far outside), the arm uses the tetrahedron of the mean.
+    Point k of Gaussian i is row 7 i + k. An arm whose end would have weights outside [-1, 2] is shortened until they
+    are inside. If no length suffices (the mean itself lies far outside), the arm uses the tetrahedron of the mean.
     """
     row = first_row + wp.tid()
     gaussian = row // 7

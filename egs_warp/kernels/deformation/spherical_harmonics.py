@@ -25,8 +25,8 @@ S1516 = wp.constant(wp.float32(np.sqrt(15 / 16)))
 
 @wp.func
 def rotate_band_1(c: wp.mat33, turn: wp.mat33) -> wp.mat33:
-    """Return coefficients 1 to 3, one row each, after the rotation ``turn``; they represent the linear function w.d
-    with w = (-c3, -c1, c2)."""
+    """Return the coefficients 1 to 3, one row each, after the rotation ``turn``. The coefficients c represent the
+    linear function w.d of the direction d, with w = (-c3, -c1, c2)."""
     w = wp.mat33(-c[2, 0], -c[2, 1], -c[2, 2], -c[0, 0], -c[0, 1], -c[0, 2], c[1, 0], c[1, 1], c[1, 2])
     w = turn * w
     return wp.mat33(-w[1, 0], -w[1, 1], -w[1, 2], w[2, 0], w[2, 1], w[2, 2], -w[0, 0], -w[0, 1], -w[0, 2])
@@ -90,8 +90,8 @@ def band_2_about_z(c: Mat53, t: wp.vec2) -> Mat53:
 
 @wp.func
 def rotate_band_2(c: Mat53, turns: EulerAngles) -> Mat53:
-    """Return coefficients 4 to 8, one row each, after the rotation. The rotation about y equals one about z between
-    quarter turns about x."""
+    """Return coefficients 4 to 8, one row each, after the rotation. The rotation about y is applied as a rotation about
+    z between quarter turns about x."""
     f = band_2_about_z(c, turns.first)
     g = Mat53()
     g[0] = f[3]
@@ -189,7 +189,7 @@ def rotate_sh_kernel(
     """Rotate the coefficients of each Gaussian's colour by ``turns`` (w, x, y, z); band 0 is not written."""
     row = first_row + wp.tid()
     count = (degree + 1) * (degree + 1)
-    # Each coefficient is read once: a row is 192 bytes, and neighbouring threads share no cache line.
+    # Read each coefficient once: a row is 192 bytes, and neighbouring threads share no cache line.
     colour = Colour()
     for j in range(1, 16):
         if j < count:

@@ -25,8 +25,8 @@ def split_kernel(
 ):
     """Write a copy of Gaussian ``parents[row]``, or, where ``axes[row]`` is not -1, one of its children.
 
-    A child is displaced along that axis by ``offsets[row]`` standard deviations of the parent, and its own standard
-    deviation along it is ``shrink`` times that of the parent.
+    A child is displaced along the axis ``axes[row]`` by ``offsets[row]`` standard deviations of the parent. Its
+    standard deviation along this axis is ``shrink`` times the parent's.
     """
     row = first_row + wp.tid()
     parent = parents[row]

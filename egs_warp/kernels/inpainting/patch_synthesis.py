@@ -13,12 +13,12 @@ RADIUS = 3
 
 @wp.struct
 class Match:
-    """Match of one patch to another."""
+    """Similarity of one patch to another."""
 
     cost: wp.float32
     """Weighted mean of the squared colour difference after the shift."""
     shift: wp.vec3
-    """Colour that is added to the source."""
+    """Colour shift that is added to the source."""
 
 
 @wp.func
@@ -30,7 +30,7 @@ def compare(
     source: wp.vec2i,
     shift_limit: wp.float32,
 ) -> Match:
-    """Return the match of the patch around ``source`` to the one at (row, column), with each pixel weighted by its
+    """Return the match of the patch around ``source`` to the patch around (row, column); each pixel is weighted by its
     confidence."""
     weight = wp.float32(0.0)
     sum = wp.vec3()
@@ -137,8 +137,8 @@ def vote_kernel(
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """Compute each pixel of the hole as the weighted mean of the patches over it; better matches weigh more (Wexler et
-    al. 2007)."""
+    """Compute the colour of each pixel of the hole as the weighted mean of the patches over it; better matches have
+    larger weights (Wexler et al. 2007)."""
     i = first_row + wp.tid()
     row = holes[i][0]
     column = holes[i][1]

@@ -1,4 +1,4 @@
-"""Kernel of the relighting: the colour of each Gaussian by the irradiance at its rotated normal.
+"""Kernel of the relighting: scales each Gaussian's colour by the irradiance at its rotated normal.
 
 Host code: ``egs_warp/lighting/relighting.py``.
 """
@@ -10,18 +10,19 @@ from egs_warp.kernels.render.spherical_harmonics import C0
 wp.set_module_options({"enable_backward": False})
 
 _STILL = wp.constant(wp.float32(0.0175))
-"""rad, rotation up to which a Gaussian keeps its colour to the bit: 1 degree, more than a body at rest sags."""
+"""rad, maximum rotation at which a Gaussian's colour is bitwise unchanged: 1 degree, more than a body at rest sags."""
 _TURNED = wp.constant(wp.float32(0.07))
-"""rad, rotation from which the relighting is complete: 4 degrees."""
+"""rad, minimum rotation at which the relighting is complete: 4 degrees."""
 _MIN_IRRADIANCE = wp.constant(wp.float32(0.2))
-"""Smallest irradiance, relative to its mean; the quadratic form is slightly negative opposite of a single light."""
+"""Minimum irradiance, relative to its mean; the quadratic form is slightly negative on the side opposite to a single
+light."""
 _MAX_RATIO = wp.constant(wp.float32(2.5))
-"""Largest ratio of two irradiances. A captured colour near black or white cannot be scaled by more."""
+"""Maximum ratio of two irradiances. A captured colour near black or white cannot be scaled by more."""
 
 
 @wp.func
 def irradiance(form: wp.mat44, normal: wp.vec3) -> wp.float32:
-    """Return the irradiance of a surface with the unit ``normal``."""
+    """Return the irradiance at a surface with the unit ``normal``, relative to the mean over all normals."""
     n = wp.vec4(normal[0], normal[1], normal[2], 1.0)
     return wp.max(wp.dot(n, form * n), _MIN_IRRADIANCE)
 
@@ -38,15 +39,15 @@ def relight_kernel(
     # Out:
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Scale the colour of each Gaussian by the ratio of the irradiance after its rotation to that at rest.
+    """Scale the colour of each Gaussian by the ratio of the irradiance after its rotation to the irradiance at rest.
 
     Args:
-        form: quadratic form of the irradiance, of mean 1 over all normals.
-        display_exponent: exponent that converts a ratio of linear light to one of displayed colours.
+        form: quadratic form of the irradiance, with mean 1 over all normals.
+        display_exponent: exponent that converts a ratio of linear light to a ratio of displayed colours.
         normals: unit normal of each Gaussian at rest; zero where it is not known.
         rotations: unit quaternions (w, x, y, z) from the rest pose.
         sh: coefficients of the deformed Gaussians.
-        sh_out: coefficients after relighting; the same bits as ``sh`` where the rotation is below ``_STILL``.
+        sh_out: coefficients after relighting; bitwise equal to ``sh`` where the rotation is below ``_STILL``.
     """
     g = wp.tid() + first_row
     q = rotations[g]

@@ -21,11 +21,11 @@ def splat_occupancy_kernel(
     # Out:
     opacity_sum_out: wp.array3d[int],
 ):
-    """Add each Gaussian's opacity to the lattice points within its 2-sigma ellipsoid, blurred by the lattice.
+    """Add each Gaussian's opacity to the lattice points within its 2-sigma ellipsoid, widened by the lattice spacing.
 
-    ``origin`` is lattice point (0, 0, 0); the lattice's axes are the cloud's own. Sigmas are limited to ``max_sigma``,
-    so that huge faint outliers do not fill empty space. The blur of 0.45 spacings makes every Gaussian reach a point;
-    without it flat ones would fall between the points.
+    ``origin`` is lattice point (0, 0, 0); the lattice's axes are the cloud's own. Standard deviations are limited to
+    ``max_sigma``, so that huge faint outliers do not fill empty space. Every Gaussian is blurred by 0.45 spacings so
+    that it reaches a lattice point; flat Gaussians would otherwise fall between the points.
     """
     i = wp.tid()
     amount = int(float(OPACITY_UNIT) / (1.0 + wp.exp(-opacity_logits[i])) + 0.5)
@@ -74,7 +74,7 @@ def enclosed_kernel(
     filled_out: wp.array3d[wp.uint8],
 ):
     """Fill the empty points from which at least ``min_hits`` of the 26 lattice directions hit the object or the ground,
-    which is everything below layer 0. Unlike a flood fill this tolerates small holes in the capture."""
+    which is everything below layer 0. Unlike a flood fill, this tolerates small holes in the capture."""
     x, y, z = wp.tid()
     if occupied[x, y, z] != wp.uint8(0):
         filled_out[x, y, z] = wp.uint8(1)

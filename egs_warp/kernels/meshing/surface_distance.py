@@ -16,9 +16,8 @@ def surface_distance_kernel(
     # Out:
     distances_out: wp.array[float],
 ):
-    """Compute the distance of each point from ``mesh``, negative where its winding number is above one half, and
-    ``max_distance`` where no triangle is as near.
-    """
+    """Compute the signed distance of each point from ``mesh``: negative where the winding number is above one half, and
+    ``max_distance`` where no triangle is nearer than that."""
     i = first_row + wp.tid()
     query = wp.mesh_query_point_sign_winding_number(mesh, points[i], max_distance)
     distance = max_distance

@@ -18,13 +18,13 @@ _FIXED_POINT_SCALE = wp.constant(wp.float32(2.0**20))
 _MAX_COVERAGE = wp.constant(wp.float32(1e6))
 """Largest coverage of one texel by one Gaussian."""
 _MIN_GRAZING_SINE = wp.constant(wp.float32(0.05))
-"""Smallest sine of the angle between ray and ground that is used in the size of a pixel on the ground."""
+"""Minimum sine of the angle between ray and ground in the computation of a pixel's size on the ground."""
 _EPSILON = wp.constant(wp.float32(1e-9))
 
 
 @wp.struct
 class Ground:
-    """Plane, and the disc of it that is shaded, in world units."""
+    """Ground plane, and the disc on it that can be in shadow, in world units."""
 
     normal: wp.vec3
     first: wp.vec3
@@ -37,7 +37,8 @@ class Ground:
     reach: wp.float32
     """Radius of the disc."""
     slope: wp.vec2
-    """Displacement along the axes of the plane, towards the light, per height over it; zero casts straight down."""
+    """Displacement along the plane's axes, towards the light, per unit of height over the plane; zero casts straight
+    down."""
 
 
 @wp.struct
@@ -83,7 +84,7 @@ def ground_kernel(
         view: camera.
         ground: plane and disc.
         eye: camera centre relative to the centre of the disc.
-        surface_depth: z-depth of the visible surface, 0 where that is the plane.
+        surface_depth: z-depth of the visible surface, 0 where the visible surface is the plane.
         depth_out: z-depth of the plane, 0 where the ray does not meet it from above.
         flat_out: position on the plane relative to the centre, along its axes.
         fade_out: 1 at the centre, 0 from ``reach`` on.
@@ -117,7 +118,7 @@ def ground_kernel(
 
 @wp.struct
 class Studio:
-    """Colours of a floor that blends into its surroundings without an edge, and its grid."""
+    """Colours of a floor that blends into its surroundings without a visible edge, and of its grid."""
 
     floor: wp.vec3
     """Floor near the camera."""
@@ -132,7 +133,7 @@ class Studio:
     """z-depth up to which the floor is clear; it reaches the colour of the horizon at ``hazy_depth``."""
     hazy_depth: wp.float32
     sky_rise: wp.float32
-    """Slope of the rays to the top of the sky's gradient."""
+    """Slope of the rays at the top of the sky's gradient."""
 
 
 @wp.func
@@ -158,8 +159,8 @@ def studio_kernel(
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """Draw a sky and a floor that fades into haze, with fine lines ``studio.cell`` apart and strong lines four times as
-    far apart."""
+    """Draw a sky and a floor that fades into haze. Fine grid lines are ``studio.cell`` apart; every fourth line is
+    strong."""
     tid = wp.tid() + first_row
     u = wp.float32(tid % view.width) + 0.5
     v = wp.float32(tid / view.width) + 0.5
@@ -186,8 +187,8 @@ def coverage_kernel(
     # Out:
     coverage: wp.array3d[wp.int64],
 ):
-    """Add the coverage of each Gaussian, its opacity times the area of its broad side, to its texel of (layers, rows,
-    columns)."""
+    """Add the coverage of each Gaussian, which is its opacity times the area of its broad side, to its texel in
+    ``coverage`` (layers, rows, columns)."""
     g = wp.tid()
     away = means[g] - ground.centre
     height = wp.max(wp.dot(away, ground.normal) + ground.rise, 0.0)
@@ -252,7 +253,8 @@ def blur_kernel(
 ):
     """Blur along the columns and write the transpose, so that two calls blur in both directions.
 
-    Each layer uses its ``taps``, the centre first, up to ``reach``. Texels outside the map are mirrored at its edge.
+    Each layer uses its own row of ``taps``, the centre first, up to its ``reach``. Texels outside the map are mirrored
+    at its edge.
     """
     tid = wp.tid() + first_row
     layer = tid / (TEXELS * TEXELS)
@@ -292,7 +294,7 @@ def combine_layers_kernel(
     # Out:
     shade_out: wp.array2d[wp.float32],
 ):
-    """Combine the layers, each of which lets a part of the light pass."""
+    """Combine the layers: the transmitted light is the product of the fractions that they transmit."""
     tid = wp.tid() + first_row
     row = tid / TEXELS
     column = tid % TEXELS
@@ -344,7 +346,7 @@ def join_covers_kernel(
     # In and out:
     cover: wp.array[wp.float32],
 ):
-    """Combine two shadows, each of which lets a part of the light pass."""
+    """Combine two shadows: the transmitted light is the product of the fractions that they transmit."""
     tid = wp.tid() + first_row
     cover[tid] = 1.0 - (1.0 - cover[tid]) * (1.0 - other[tid])
 

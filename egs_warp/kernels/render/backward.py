@@ -1,9 +1,9 @@
 """Backward pass of the projection, written by hand: gradients from (Gaussian, tile) pairs to Gaussians and to the
 camera pose.
 
-Every sum has one thread and a fixed order: there are no atomics, and every run gives the same bits. The equations are
-those of ``projection`` in reverse order; ``by_x`` is the gradient of the loss with respect to x. Host code:
-``egs_warp/render/backward.py``.
+Each sum is computed by one thread in a fixed order. There are no atomics, so every run gives the same bits. The
+equations are the derivatives of those in ``projection``, in reverse order; ``by_x`` is the gradient of the loss with
+respect to x. Host code: ``egs_warp/render/backward.py``.
 """
 
 import warp as wp
@@ -23,7 +23,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class SplatGradient:
-    """Gradient with respect to a splat on the screen, whose -ln(alpha / opacity) = a u^2 + v dy^2 with u = dx + shear
+    """Gradient with respect to a splat on the screen, where -ln(alpha / opacity) = a u^2 + v dy^2 with u = dx + shear
     dy."""
 
     log_opacity: wp.float32
@@ -87,8 +87,8 @@ def splat_gradient(
 
 @wp.func
 def covariance_gradient(covariance: ScreenCovariance, by: SplatGradient, antialiased: wp.int32) -> wp.vec3:
-    """Return the gradient with respect to xx, yy and xy, through a = yy / (2 det), shear = -xy / yy, v = 1 / (2 yy) and
-    the opacity factor of the low-pass."""
+    """Return the gradient with respect to the entries xx, yy and xy of the screen covariance, through a = yy / (2 det),
+    shear = -xy / yy, v = 1 / (2 yy) and the opacity factor of the low-pass."""
     inv_det = 1.0 / covariance.determinant
     by_xx = -0.5 * by.a * (covariance.yy * inv_det) * (covariance.yy * inv_det)
     by_yy = (
@@ -193,7 +193,7 @@ def quaternion_gradient(q: wp.vec4, by_rotation: wp.mat33) -> wp.vec4:
 
 @wp.func
 def clamp_gradient(raw: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
-    """Return the gradient with respect to the SH sum; the colour is max(sum + 0.5, 0)."""
+    """Return the gradient with respect to the SH sum, where the colour is max(sum + 0.5, 0)."""
     return wp.vec3(
         wp.where(raw[0] > -0.5, by_colour[0], 0.0),
         wp.where(raw[1] > -0.5, by_colour[1], 0.0),
@@ -203,8 +203,8 @@ def clamp_gradient(raw: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
 
 @wp.func
 def offset_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, offset: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
-    """Return the gradient with respect to the vector from the camera's centre to the mean, through the colour, which
-    depends on its direction."""
+    """Return the gradient with respect to ``offset``, the vector from the camera's centre to the mean, through the
+    colour: the colour depends on the direction of this vector."""
     distance = wp.length(offset)
     direction = offset / distance
     by_direction = sh_direction_gradient(sh, g, direction, by_colour)
@@ -276,8 +276,8 @@ def pose_backward_kernel(
     by_pose_rotation_out: wp.array[wp.mat33],
     by_pose_translation_out: wp.array[wp.vec3],
 ):
-    """Compute the gradient with respect to one Gaussian's screen position, and its part of the gradient with respect to
-    the camera pose.
+    """Compute the gradient with respect to one Gaussian's screen position, and its contribution to the gradient with
+    respect to the camera pose.
 
     Outputs that are not requested are empty arrays.
     """

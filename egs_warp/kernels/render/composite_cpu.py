@@ -1,7 +1,7 @@
 """C++ code of compositing on a CPU: one thread per tile, eight pixels of a row at a time.
 
-It uses vectors of eight, which Clang maps to the SIMD instructions of the processor. The half rows of a tile that an
-ellipse reaches are computed for eight rows at once; half rows whose pixels are all opaque are skipped.
+It uses vectors of eight floats, which Clang maps to the SIMD instructions of the processor. The half rows of a tile
+that an ellipse reaches are computed for eight rows at once. Half rows whose pixels are all opaque are skipped.
 """
 
 from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP

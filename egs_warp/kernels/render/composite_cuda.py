@@ -1,9 +1,9 @@
-"""CUDA C++ code of compositing: one block of 256 threads per tile, one warp for each of its eight parts of 8 x 4
-pixels.
+"""CUDA C++ code of compositing: one block of 256 threads per tile, and one warp for each of the eight 8 x 4 pixel parts
+of the tile.
 
 Splats pass through shared memory in batches. The thread that loads a splat also computes which of the eight parts its
-ellipse reaches, and each warp then visits only its own splats. The code is CUDA C++ because Warp's tile functions offer
-neither ballots nor per-warp control flow; Warp compiles it at run time like every other kernel.
+ellipse reaches, and each warp then visits only the splats that reach its part. The code is CUDA C++ because Warp's tile
+functions offer neither ballots nor per-warp control flow. Warp compiles it at run time like every other kernel.
 """
 
 from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP

@@ -41,7 +41,7 @@ def composite_tile(
     alpha_out: wp.array2d[wp.float32],
     depth: wp.array2d[wp.float32],
 ):
-    """Blend one tile from front to back, by its thread (CPU) or block (CUDA).
+    """Blend one tile from front to back, by one thread (CPU) or one block (CUDA).
 
     A splat whose mean is deeper than the ``max_depth`` of a pixel is skipped there; 0 or an empty array means no limit.
     """
@@ -89,7 +89,7 @@ def composite_backward_block(
     """Sum the gradients of one tile's splats by its block (CUDA), in the order and with the rounding of
     ``composite_tile``.
 
-    ``sum_gradient`` and ``remaining`` are those of the thread's own pixel.
+    ``sum_gradient`` and ``remaining`` belong to the thread's own pixel.
     """
     ...
 

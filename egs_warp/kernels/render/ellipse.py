@@ -1,4 +1,5 @@
-"""Screen ellipses: constants of the splatting model, the alpha of a splat, and the exact ellipse-tile test."""
+"""Screen ellipses: constants of the splatting model, the alpha of a splat, and an exact intersection test of ellipse
+and tile."""
 
 import math
 
@@ -16,10 +17,9 @@ ALPHA_CUT = wp.constant(wp.float32(_ALPHA_CUT))
 """Alpha below which a splat does not affect a pixel."""
 LOG_255 = wp.constant(wp.float32(-math.log(_ALPHA_CUT)))
 ALPHA_LIMIT = wp.constant(wp.float32(_ALPHA_LIMIT))
-"""Largest alpha of one splat; above it no gradient flows."""
+"""Maximum alpha of one splat; where alpha reaches it, the gradient is zero."""
 TRANSMITTANCE_STOP = wp.constant(wp.float32(_TRANSMITTANCE_STOP))
-"""A splat that would bring the transmittance to this value or lower is not blended, and neither are the splats behind
-it."""
+"""If a splat would reduce the transmittance to this value or less, neither it nor the splats behind it are blended."""
 TILE = wp.constant(16)
 """Side of a square tile, pixels."""
 TILE_PIXELS = wp.constant(256)
@@ -31,7 +31,7 @@ CUTOFFS_IN_CPP = f"""
     constexpr float LIMIT = {_ALPHA_LIMIT}f;
     constexpr float STOP = {_TRANSMITTANCE_STOP}f;
 """
-"""C++ constants of the same values, for compositing."""
+"""C++ constants with the same values, for compositing."""
 
 
 @wp.func
@@ -72,8 +72,8 @@ def tile_rows(ellipse: wp.vec4, falloff: wp.vec2, height: wp.int32) -> wp.vec2i:
 
 @wp.func
 def tile_columns(ellipse: wp.vec4, falloff: wp.vec2, row: wp.int32, width: wp.int32, height: wp.int32) -> wp.vec2i:
-    """Return the first and last tile column that the ellipse reaches within a tile row. The test is exact, because the
-    ellipse is convex."""
+    """Return the first and last tile column in which the ellipse has points within a tile row. The test is exact,
+    because the ellipse is convex."""
     cut = falloff[1] + LOG_255
     top = wp.float32(row * TILE) + 0.5 - ellipse[1]
     bottom = wp.float32(wp.min(row * TILE + TILE, height)) - 0.5 - ellipse[1]

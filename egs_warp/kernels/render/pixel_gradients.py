@@ -19,10 +19,10 @@ def pixel_gradient(
     """Return the gradient with respect to a pixel's weighted sums, and the initial remaining sum for a front-to-back
     traversal.
 
-    With s_i = (colour_i, depth_i) . gradient, the loss is linear in the weights w_i and the final transmittance T:
-    dL/dalpha_i = T_i s_i - (sum of w_j s_j over j > i + T dL/dT) / (1 - alpha_i). The remaining sum is that bracket
-    with all splats in the sum. The front-to-back traversal subtracts from it, so it needs no second pass and no stored
-    state. An empty array stands for a zero gradient.
+    With s_i = (colour_i, depth_i) . gradient, the loss is linear in the weights w_i and in the final transmittance T:
+    dL/dalpha_i = T_i s_i - (sum of w_j s_j over j > i + T dL/dT) / (1 - alpha_i). The initial remaining sum is the
+    bracket with the sum over all splats. The front-to-back traversal subtracts each w_j s_j from it, so it needs no
+    second pass and no stored state. An empty array represents a zero gradient.
     """
     opaque = alpha[row, column]
     by_colour = wp.vec3()
@@ -36,7 +36,7 @@ def pixel_gradient(
         by_depth_sum = depth_gradient[row, column] / opaque
     depth_sum = depth[row, column] * opaque
     by_alpha = by_alpha - by_depth_sum * depth[row, column]
-    # colour holds T times the background already; depth times alpha is the weighted sum of depths.
+    # ``colour`` already contains T times the background; depth times alpha is the weighted sum of depths.
     remaining = wp.dot(by_colour, colour[row, column]) + by_depth_sum * depth_sum - (1.0 - opaque) * by_alpha
     return wp.vec4(by_colour[0], by_colour[1], by_colour[2], by_depth_sum), remaining
 
@@ -55,7 +55,8 @@ def pixel_gradients_kernel(
     sum_gradient_out: wp.array[wp.vec4],
     remaining_out: wp.array[wp.float32],
 ):
-    """Compute ``pixel_gradient`` of every pixel (CPU only; the GPU compositor computes it itself)."""
+    """Compute ``pixel_gradient`` for every pixel. Used on a CPU only; the backward kernel on a GPU calls
+    ``pixel_gradient`` itself."""
     i = wp.tid() + first
     by_sums, remaining = pixel_gradient(
         i / colour.shape[1],

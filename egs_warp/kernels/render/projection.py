@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 NOT_FINITE = wp.constant(wp.int64(2**36))
-"""Tile count of a Gaussian with a non-finite value; more than any image has."""
+"""Tile count that marks a Gaussian with a non-finite value; larger than the tile count of any image."""
 
 
 @wp.struct
@@ -81,8 +81,8 @@ def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple
 
 @wp.struct
 class ScreenCovariance:
-    """Screen covariance of one Gaussian, square pixels; the low-pass is added, except in the fields that begin with
-    ``sharp_``."""
+    """Screen covariance of one Gaussian, square pixels. The low-pass is added, except in the fields whose names begin
+    with ``sharp_``."""
 
     sharp_xx: wp.float32
     sharp_yy: wp.float32
@@ -102,7 +102,7 @@ def screen_covariance(row_x: wp.vec3, row_y: wp.vec3) -> ScreenCovariance:
     covariance.xy = wp.dot(row_x, row_y)
     covariance.xx = covariance.sharp_xx + LOW_PASS
     covariance.yy = covariance.sharp_yy + LOW_PASS
-    # Cauchy-Binet: a sum of positive terms, exact where xx yy - xy^2 cancels.
+    # Cauchy-Binet: the determinant as a sum of positive terms, which is accurate where xx yy - xy^2 cancels.
     covariance.sharp_determinant = wp.length_sq(wp.cross(row_x, row_y))
     covariance.determinant = (
         covariance.sharp_determinant + LOW_PASS * (covariance.sharp_xx + covariance.sharp_yy) + LOW_PASS * LOW_PASS
@@ -138,7 +138,7 @@ def project_kernel(
     log_scale = log_scales[g]
     logit = opacity_logits[g]
     tile_count_out[g] = wp.int64(0)
-    # -inf is a legal logarithm of a flat Gaussian's scale, but the file readers never return one.
+    # -inf is a valid log scale of a flat Gaussian, but the file readers never return one.
     if not (wp.isfinite(mean) and wp.isfinite(q) and wp.isfinite(log_scale) and wp.isfinite(logit)):
         tile_count_out[g] = NOT_FINITE
         return

@@ -14,12 +14,12 @@ C32 = wp.constant(wp.float32(2.890611442640554))
 C31 = wp.constant(wp.float32(0.4570457994644658))
 C30 = wp.constant(wp.float32(0.3731763325901154))
 C3B = wp.constant(wp.float32(1.445305721320277))
-"""Factors of the basis: of band 0, of band 1, and of bands 2 and 3 by order."""
+"""Factors of the basis functions: band 0, band 1, and bands 2 and 3 by order."""
 
 
 @wp.func
 def sh_sum(sh: wp.array2d[wp.vec3], g: wp.int32, coefficients: wp.int32, d: wp.vec3) -> wp.vec3:
-    """Return the SH sum of Gaussian ``g`` in the unit direction ``d``, INRIA signs, without the +0.5."""
+    """Return the SH sum of Gaussian ``g`` in the unit direction ``d``, INRIA signs, without the offset of 0.5."""
     x = d[0]
     y = d[1]
     z = d[2]
@@ -51,8 +51,8 @@ def sh_sum(sh: wp.array2d[wp.vec3], g: wp.int32, coefficients: wp.int32, d: wp.v
 
 @wp.func
 def sh_direction_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, d: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
-    """Return the gradient with respect to the unit direction ``d`` towards Gaussian ``g``, with its three components
-    taken as independent."""
+    """Return the gradient with respect to the unit direction ``d`` towards Gaussian ``g``; the three components of
+    ``d`` are treated as independent."""
     x = d[0]
     y = d[1]
     z = d[2]

@@ -1,8 +1,8 @@
 """Kernels that list the Gaussians of every tile from front to back.
 
-A *slot* numbers the (Gaussian, tile) pairs Gaussian by Gaussian, row by row of tiles; an *intersection* numbers the
-same pairs tile by tile, nearest first. Gradients are written by slot, so that those of one Gaussian are contiguous.
-Host code: ``egs_warp/render/tiles.py``.
+A *slot* is the index of a (Gaussian, tile) pair when pairs are numbered by Gaussian, then by tile row. An
+*intersection* is the index of the same pair when pairs are numbered by tile, nearest first. Gradients are written by
+slot, so that the gradients of one Gaussian are contiguous. Host code: ``egs_warp/render/tiles.py``.
 """
 
 import warp as wp
@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 EMPTY_KEY = wp.constant(wp.uint32(0xFFFFFFFF))
-"""Sort key of unused capacity, larger than that of every tile."""
+"""Sort key of unused capacity, larger than the keys of all tiles."""
 
 
 @wp.func
@@ -26,7 +26,7 @@ def first_slot_of(slot_end: wp.array[wp.int64], g: wp.int32) -> wp.int32:
 
 
 PREFETCH_DISTANCE = wp.constant(12)
-"""Number of Gaussians to prefetch ahead, since Gaussians in depth order are scattered in memory."""
+"""Number of Gaussians to prefetch ahead, because Gaussians in depth order are scattered in memory."""
 
 
 @wp.func_native("""
@@ -37,7 +37,7 @@ PREFETCH_DISTANCE = wp.constant(12)
 #endif
 """)
 def prefetch_ellipse(slot_end: wp.array[wp.int64], ellipse: wp.array[wp.vec4], falloff: wp.array[wp.vec2], g: wp.int32):
-    """Prefetch what ``count_tiles_kernel`` reads of Gaussian ``g`` into the CPU's cache."""
+    """Prefetch the data of Gaussian ``g`` that ``count_tiles_kernel`` reads into the CPU's cache."""
     ...
 
 
@@ -47,7 +47,7 @@ def prefetch_ellipse(slot_end: wp.array[wp.int64], ellipse: wp.array[wp.vec4], f
 #endif
 """)
 def prefetch_slots(slot_end: wp.array[wp.int64], g: wp.int32):
-    """Prefetch what ``fill_tiles_kernel`` reads of Gaussian ``g`` into the CPU's cache."""
+    """Prefetch the data of Gaussian ``g`` that ``fill_tiles_kernel`` reads into the CPU's cache."""
     ...
 
 
@@ -66,7 +66,7 @@ def count_tiles_kernel(
     tile_from_slot_out: wp.array[wp.int32],
     count_out: wp.array2d[wp.int32],
 ):
-    """Count the Gaussians of one chunk in each tile, from front to back, with one thread (CPU)."""
+    """Count the Gaussians of one chunk in each tile, by one thread (CPU)."""
     chunk = wp.tid() + first_chunk
     columns = (width + TILE - 1) / TILE
     last = chunk_start[chunk + 1] - 1
@@ -133,15 +133,16 @@ def emit_tiles_kernel(
     key_out: wp.array[wp.uint32],
     slot_and_gaussian_out: wp.array[wp.int32],
 ):
-    """Write the sort key (tile, then the leading bits of the depth) and the number of every slot, and its Gaussian at
-    offset 2 ``capacity``.
+    """Write, for every slot, the sort key (the tile, then the leading bits of the depth), the slot's number, and its
+    Gaussian (at offset 2 ``capacity``).
 
-    If the pairs exceed the capacity, all keys are empty.
+    If the number of pairs exceeds the capacity, all keys are empty.
     """
     g = wp.tid()
     pair_count = slot_end[slot_end.shape[0] - 1]
     fits = pair_count >= wp.int64(0) and pair_count <= wp.int64(capacity)
-    # Slot numbers are written here, where the writes of neighbouring threads are contiguous, and not in the loop below.
+    # Write the slot numbers here and not in the loop below, because here the writes of neighbouring threads are
+    # contiguous.
     for i in range(g, capacity, slot_end.shape[0]):
         slot_and_gaussian_out[i] = i
         if not fits or wp.int64(i) >= pair_count:
@@ -187,10 +188,10 @@ def finish_lists_kernel(
     gaussian_from_intersection_out: wp.array[wp.int32],
     slot_from_intersection_out: wp.array[wp.int32],
 ):
-    """Write the start of each tile's run in the sorted pairs, and order the few pairs whose leading depth bits are
+    """Write the start of each tile's run in the sorted pairs, and sort the few pairs whose leading depth bits are
     equal.
 
-    Thread i writes the starts of the tiles after that of pair i-1 up to that of pair i.
+    Thread i writes the starts of all tiles after the tile of pair i-1, up to the tile of pair i.
     """
     i = wp.tid()
     tiles = tile_start_out.shape[0] - 1
@@ -205,7 +206,8 @@ def finish_lists_kernel(
         slot = slot_and_gaussian[i]
         gaussians = 2 * capacity
         g = slot_and_gaussian[gaussians + slot]
-        # The sort is stable: pairs with equal keys keep the order of their slots, which also orders equal depths.
+        # The sort is stable: pairs with equal keys retain the order of their slots, so Gaussians at equal depths are
+        # ordered, too.
         place = i
         j = i - 1
         while j >= 0 and key[j] == own:

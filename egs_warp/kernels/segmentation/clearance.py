@@ -50,10 +50,12 @@ def half_space_kernel(
     log_scale_out: wp.array[wp.vec3],
     opacity_logit_out: wp.array[wp.float32],
 ):
-    """Compute mass, mean and covariance of the part of Gaussian ``source`` on the side that the normal points to.
+    """Compute mass, mean and covariance of the part of Gaussian ``source`` on the side of the plane to which the normal
+    points.
 
     With A = R S and w = A^T N / sigma, Sigma - c Sigma N N^T Sigma / sigma^2 = A' A'^T for A' = A (I - (1 - sqrt(1 -
-    c)) w w^T). The factor A' is decomposed, because the square would lose flat splats.
+    c)) w w^T). The factor A' is decomposed instead of the covariance, whose rounding errors exceed the smallest
+    variance of flat splats.
     """
     row = first_row + wp.tid()
     g = source[row]
@@ -82,7 +84,7 @@ def half_space_kernel(
         wp.log(wp.max(wp.length(m.b), 1.0e-20)),
         wp.log(wp.max(wp.length(m.c), 1.0e-20)),
     )
-    # Viewed along the plane, mass is opacity times width.
+    # Seen along the plane, the mass is proportional to opacity times width.
     opacity = 1.0 / (1.0 + wp.exp(-opacity_logits[g]))
     peak = wp.clamp(opacity * wp.min(mass_fraction / narrowed, 1.0), 1.0e-6, 0.999999)
     opacity_logit_out[row] = wp.log(peak / (1.0 - peak))

@@ -1,4 +1,4 @@
-"""Photo loss (L1 and SSIM) between a render with the photo's exposure and the photo, and its derivative: one thread per
+"""Photo loss (L1 and SSIM) between a photo and a render at the photo's exposure, and its derivative: one thread per
 pixel.
 
 Host code: ``egs_warp/training/photo_loss.py``.
@@ -42,7 +42,7 @@ def tone_kernel(
     front_out: wp.array[wp.vec3],
     off_out: wp.array[wp.float32],
 ):
-    """Compute the two images to compare; ``front`` is the render before the colour transform, without the backdrop."""
+    """Compute the two images to compare. ``front`` is the render before the colour transform, without the backdrop."""
     p = first_row + wp.tid()
     m = tone_of(tone)
     b = shift_of(tone)
@@ -57,7 +57,7 @@ def tone_kernel(
     counts = wp.float32(1.0)
     if weight.shape[0] > 1:
         counts = weight[p]
-    # Pixels of weight zero must not enter the SSIM windows of others either.
+    # Pixels of weight zero must not affect the SSIM windows of other pixels.
     if counts <= 0.0:
         toned = photo
     off = toned - photo
@@ -123,8 +123,8 @@ def similarity_kernel(
     by_square_out: wp.array[wp.vec3],
     by_product_out: wp.array[wp.vec3],
 ):
-    """Compute the loss (1 - w) L1 + w (1 - SSIM) of a pixel, and the derivative of its SSIM with respect to the blurred
-    mean, square and product."""
+    """Compute the loss (1 - w) L1 + w (1 - SSIM) of a pixel, and the derivatives of its SSIM with respect to the
+    blurred means, squares and products."""
     p = first_row + wp.tid()
     row = p // width
     mean_a = wp.vec3(0.0)

@@ -1,4 +1,4 @@
-"""Updates of every Gaussian at every training step, other than Adam's.
+"""Updates of all Gaussians in every training step, other than Adam's.
 
 Host code: ``egs_warp/training/relocation.py``.
 """
@@ -47,11 +47,11 @@ def jitter_kernel(
     opacity_logits: wp.array[wp.float32],
     means_out: wp.array[wp.vec3],
 ):
-    """Move each mean by ``size`` times its covariance times ``noise``; the more opaque the Gaussian, the smaller its
-    displacement."""
+    """Move each mean by ``size`` times its covariance times ``noise``. The displacement is smaller for more opaque
+    Gaussians."""
     n = first_row + wp.tid()
     gate = sigmoid(-STEEPNESS * (sigmoid(opacity_logits[n]) - faint))
-    # A smaller gate has no visible effect.
+    # Below this value, the displacement has no visible effect.
     if gate > 1.0e-6:
         turn = rotation_from_quaternion(rotations[n])
         local = wp.transpose(turn) * noise[n]

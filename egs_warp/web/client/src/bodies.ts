@@ -15,9 +15,9 @@ export interface CageTrack {
 
 export interface Body {
   splats: SplatData;
-  /** Undefined for static splats. */
+  /** Cage that moves the splats; undefined for static splats. */
   track?: CageTrack | undefined;
-  /** Undefined if the colours do not change with the normals. */
+  /** Change of the colours with the normals; undefined if the colours do not change. */
   relighting?: Relighting | undefined;
 }
 
@@ -42,7 +42,7 @@ export class Bodies {
   private readonly moving: MovingBody[] = [];
   private readonly still: DeformedSplats[] = [];
 
-  /** With `hasMarks`, the colour of a moving splat depends on the object to which it belongs. */
+  /** With `hasMarks`, the colour of a moving splat depends on the object to which the splat belongs. */
   constructor(bodies: Body[], { shadow, hasMarks = false }: { shadow?: Shadow | undefined; hasMarks?: boolean } = {}) {
     const nodes = bodies.map(({ track }) => track?.rest.length ?? 0);
     this.positions = new Float32Array(nodes.reduce((sum, count) => sum + count, 0));
@@ -91,7 +91,7 @@ export class Bodies {
     for (const { generator } of this.still) generator.visible = visible;
   }
 
-  /** Light up the moving splats of the object `active`; see `DeformedSplats.mark`. */
+  /** Brighten the moving splats of the object `active`; see `DeformedSplats.mark`. */
   mark(labels: Uint8Array, active: number): void {
     for (const { splats } of this.moving) splats.mark(labels, active);
   }

@@ -59,14 +59,14 @@ export class LiveClock {
     this.arrivals = [];
   }
 
-  /** Advance by `elapsed` wall-clock seconds; return true if the shown time has changed. */
+  /** Advance by `elapsed` wall-clock seconds; return true if the displayed time has changed. */
   advance(elapsed: number): boolean {
     const newest = this.frames.at(-1);
     if (newest === undefined || this.time >= newest.time) return false;
     const lead = newest.time - this.time;
     const targetLead = this.speed * this.delay();
-    // Play slower if few frames are left, but hardly faster if many are: steps in the air are quick, and the frames
-    // gained there bridge the slow steps on the ground.
+    // Play slower if few frames are left, but hardly faster if many are: steps in the air are fast to compute, and the
+    // frames gained there cover the time of the slow steps on the ground.
     const speed =
       lead < targetLead
         ? this.speed * Math.max(lead / targetLead, 0.15)
@@ -100,7 +100,7 @@ export class LiveClock {
   }
 }
 
-/** Return true if the creature was reset to another position between two frames: no step moves it that far. */
+/** Return true if the creature was reset between two frames, to a position that no step can reach. */
 function isDiscontinuous(before: Frame, after: Frame): boolean {
   const [a, b] = [before.positions, after.positions];
   let low = Infinity;

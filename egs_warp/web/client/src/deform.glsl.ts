@@ -1,5 +1,5 @@
-// Deformation of one splat in the shader. It gives the same values as egs_warp/kernels/deformation, but needs no SVD,
-// because it returns a covariance.
+// Deformation of one splat in the shader. It gives the same values as egs_warp/kernels/deformation but needs no SVD,
+// because its result is a covariance.
 
 import { TEXTURE_WIDTH } from "./cage";
 import { SHADOW_GLSL } from "./shadow.glsl";

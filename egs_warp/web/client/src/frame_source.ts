@@ -1,4 +1,4 @@
-// Sources of frames: a file with all frames of a run, or a socket that sends frames during the simulation.
+// Sources of frames: a file with all frames of a run, or a socket that receives frames during the simulation.
 
 import type { PickNews } from "./pick_news";
 import { readFrame, readFrames, readHeader, type Frame, type Header, type Style } from "./packets";
@@ -80,7 +80,7 @@ export class LiveSource implements FrameSource {
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
   }
 
-  /** Set the message handler and pass it the messages that arrived earlier. */
+  /** Set the message handler and call it for the messages that arrived earlier. */
   listen(onNews: (news: News) => void): void {
     this.onNews = onNews;
     for (const news of this.pendingNews ?? []) onNews(news);
@@ -104,13 +104,13 @@ export class LiveSource implements FrameSource {
   }
 }
 
-/** Code with which the server closes the socket of a second page (RFC 6455). */
+/** Code with which the server closes the socket of an additional page (RFC 6455). */
 const TRY_AGAIN_LATER = 1013;
-/** Time after which a closed connection is tried again, ms. */
+/** Time after which a reconnection is tried, ms. */
 const RETRY_TIME = 500;
 
-/** Connect to a session, wait while another page shows it, and reconnect after a lost connection. The header comes
- * first, then frames and messages. */
+/** Connect to a session. Wait while another page shows the session, and reconnect after a lost connection. The header
+ * arrives first, then frames and messages. */
 export function fromSocket(address: string, onState: (lost: string | undefined) => void): Promise<LiveSource> {
   return new Promise((resolve, reject) => {
     let source: LiveSource | undefined;
@@ -122,7 +122,7 @@ export function fromSocket(address: string, onState: (lost: string | undefined) 
         if (first) {
           first = false;
           const { header } = readHeader(data as ArrayBuffer);
-          // Continue after a reconnection to the same session; reload if it is another one.
+          // Continue after a reconnection to the same session; reload the page if the session is another one.
           if (source === undefined) source = new LiveSource(header, socket);
           else if (source.header.facts.session !== header.facts.session) location.reload();
           else source.socket = socket;

@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import { WideLines } from "./wide_lines";
 
-/** Its components are sRGB values, which the shader writes unchanged. */
+/** Accent colour; its components are sRGB values, which the shader writes unchanged. */
 const ACCENT = new THREE.Color(0x7fd1b8).convertLinearToSRGB();
 const PULL = new THREE.Color(0xffc24a).toArray();
 

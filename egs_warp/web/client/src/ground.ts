@@ -1,25 +1,26 @@
-// Floor with a grid that turns into a sky without an edge, as in the film, and the creature's soft shadow.
+// Floor with a grid that turns gradually into a sky, as in the film, and the creature's soft shadow.
 
 import * as THREE from "three";
 import type { MainLight } from "./packets";
-// Explained in egs_warp/render/backdrop.py.
+// The entries are explained in egs_warp/render/backdrop.py.
 import studio from "../../../render/studio.json";
 import { SHADOW_GLSL, WIDE_RADIUS } from "./shadow.glsl";
 
-/** Colour behind a captured scene, and behind the creature if the ground is hidden. */
+/** Background colour behind a captured scene, and behind the creature if the ground is hidden. */
 export const BACKGROUND = 0xb9bec6;
-/** Depth below which the floor hides splats, in body heights; pressed soles may be below the ground by a part of it. */
+/** Depth below which the floor hides splats, in body heights. Pressed soles extend below the ground by less than
+ * this. */
 export const FLOOR_DEPTH = 0.015;
 const SHADOW_SIDE = 256;
 /** Radius of the contact shadow, as a fraction of the side of the shadow map. */
 const SOFTNESS = 0.014;
-/** Smallest sine of the elevation of the main light that is used, as in egs_warp/render/shadow.py. */
+/** Minimum sine of the elevation of the main light, as in egs_warp/render/shadow.py. */
 const MIN_SINE = 0.17;
-/** Part of the body height by which the shadow map is displaced along the shadow of the main light. */
+/** Displacement of the shadow map along the main light's shadow, as a fraction of the displacement at body height. */
 const CAST_SHIFT = 0.4;
-/** Largest displacement of the map, in body heights: the body stays on it. */
+/** Maximum displacement of the map, in body heights, at which the body is still on the map. */
 const MAX_SHIFT = 0.8;
-/** Blending that keeps the largest value of each channel. */
+/** Blending that retains the maximum of each channel. */
 const BRIGHTEST = {
   side: THREE.DoubleSide,
   depthTest: false,
@@ -28,7 +29,7 @@ const BRIGHTEST = {
   blendSrc: THREE.OneFactor,
   blendDst: THREE.OneFactor,
 } as const;
-/** GLSL literals of the floor's look. */
+/** Floor settings as GLSL literals. */
 const LOOK = {
   floor: vec3(studio.floor),
   horizon: vec3(studio.horizon),
@@ -45,14 +46,14 @@ export class Ground {
   readonly shadow: { texture: THREE.Texture; region: THREE.Vector4 };
   /** Sky and floor, drawn as one triangle behind everything else. */
   readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
-  /** Shadow alone, on a floor that is seen through the image. */
+  /** The shadow alone, for a floor that is part of the image behind it. */
   readonly shadowMesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
   private readonly target: THREE.WebGLRenderTarget;
   private readonly camera: THREE.OrthographicCamera;
   private readonly caster: THREE.Mesh;
   private readonly casters = new THREE.Scene();
   private readonly points: THREE.BufferAttribute;
-  /** Displacement of the shadow of the main light, per height over the ground. */
+  /** Displacement of the main light's shadow, per unit of height over the ground. */
   private readonly slope = new THREE.Vector2();
 
   constructor(surface: Int32Array, nodeCount: number, height: number, light?: MainLight) {
@@ -172,7 +173,7 @@ export class Ground {
       camera.getWorldDirection(forward!.value as THREE.Vector3);
       const projection = camera.projectionMatrix.elements;
       (slope!.value as THREE.Vector2).set(1 / projection[0]!, 1 / projection[5]!);
-      // The image of a headset's eye is not symmetric.
+      // The projection of a headset's eye is not symmetric.
       (middle!.value as THREE.Vector2).set(projection[8]!, projection[9]!);
     };
     this.shadowMesh = new THREE.Mesh(
@@ -216,7 +217,7 @@ export class Ground {
       alpha: renderer.getClearAlpha(),
       xr: renderer.xr.enabled,
     };
-    // A headset would replace the camera.
+    // With XR enabled, three.js would replace the camera by the headset's.
     renderer.xr.enabled = false;
     renderer.setRenderTarget(this.target);
     renderer.setClearColor(0x000000, 1);
@@ -251,7 +252,7 @@ export class Ground {
   }
 }
 
-/** Return a literal of GLSL, where a number without a decimal point is an integer. */
+/** Return a GLSL float literal; a number without a decimal point would be an integer. */
 function float(value: number): string {
   return Number.isInteger(value) ? value.toFixed(1) : String(value);
 }

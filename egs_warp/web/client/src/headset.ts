@@ -1,6 +1,6 @@
-// WebXR: buttons, sessions, and where the creature stands in the room of the user, in metres.
+// WebXR: buttons, sessions, and the position of the creature in the user's room, in metres.
 //
-// The scene has z up and its floor at z = 0, the local-floor space of a headset has y up and its floor at y = 0. An
+// The scene has z up and its floor at z = 0; the local-floor space of a headset has y up and its floor at y = 0. An
 // offset reference space maps one to the other, so that the scene itself does not move.
 
 import * as THREE from "three";
@@ -8,18 +8,18 @@ import { button, type Icon } from "./dom";
 import type { Stage } from "./stage";
 
 const UP = new THREE.Vector3(0, 1, 0);
-/** Turns the axes of the scene to those of a headset. */
+/** Rotation from the axes of the scene to the axes of a headset. */
 const Z_UP_TO_Y_UP = new THREE.Quaternion().setFromAxisAngle(new THREE.Vector3(1, 0, 0), -Math.PI / 2);
-/** Distance of the creature from the user at the start: at least this number of metres, and of body heights. */
+/** Initial distance of the creature from the user: at least this number of metres, and of body heights. */
 const MIN_DISTANCE = 1.2;
 const MIN_DISTANCE_IN_HEIGHTS = 1.5;
-/** A point of the floor further away than this is not used, in metres and body heights. */
+/** Maximum distance of a selected point of the floor, in metres and in body heights. */
 const MAX_REACH = 20;
 const MAX_REACH_IN_HEIGHTS = 10;
 /** Depth range of a headset, m. */
 const NEAR = 0.05;
 const FAR = 200;
-/** Vertical component of the normal of a surface on which the creature can stand. */
+/** Minimum vertical component of the normal of a surface on which the creature can stand. */
 const MIN_FLOOR_NORMAL = 0.9;
 const POINTER_COLOUR = 0x7fd1b8;
 
@@ -45,12 +45,12 @@ export class Headset {
   private mode: XRSessionMode | undefined;
   /** Reference space with its floor at y = 0. */
   private base: XRReferenceSpace | undefined;
-  /** Pose of the scene in `base`; undefined until the user's place is known. */
+  /** Pose of the scene in `base`; undefined until the position of the user is known. */
   private pose: { position: THREE.Vector3; rotation: THREE.Quaternion } | undefined;
   private hits: XRHitTestSource | undefined;
-  /** Source that moves the creature, and the point of the floor by which it holds it. */
+  /** Input source that moves the creature, and the point of the floor at which the source has grabbed it. */
   private grab: { source: XRInputSource; point: THREE.Vector3 } | undefined;
-  /** From the point at which the page's camera looks to that camera. */
+  /** Vector from the target of the page's camera to that camera. */
   private readonly eyeOffset = new THREE.Vector3();
   private readonly pointer = createPointer();
   private readonly disposal = new AbortController();
@@ -62,7 +62,7 @@ export class Headset {
       return created;
     });
     stage.scene.add(this.pointer.group);
-    // After three.js has restored the canvas.
+    // This listener runs after three.js has restored the canvas.
     stage.renderer.xr.addEventListener("sessionend", () => this.end());
     navigator.xr?.addEventListener("devicechange", () => void this.showButtons(), { signal: this.disposal.signal });
     void this.showButtons();
@@ -72,7 +72,7 @@ export class Headset {
     return this.session !== undefined;
   }
 
-  /** Start a session, which needs a click or a key press of the user. */
+  /** Start a session. The browser requires a click or a key press of the user. */
   async enter(mode: XRSessionMode): Promise<void> {
     if (navigator.xr === undefined || this.isPresenting) return;
     const { xr } = this.stage.renderer;
@@ -104,7 +104,7 @@ export class Headset {
     await this.session?.end();
   }
 
-  /** End the session and forget the browser's devices, which would keep the stage in memory. */
+  /** End the session and release the browser's XR objects, which would keep the stage in memory. */
   async dispose(): Promise<void> {
     this.disposal.abort();
     await this.leave();
@@ -136,13 +136,13 @@ export class Headset {
     try {
       await this.enter(mode);
     } catch (error) {
-      // The user has declined, or the device is in use.
+      // The user has declined the session, or the device is in use.
       this.buttons[MODES.findIndex((one) => one.mode === mode)]!.title =
         error instanceof Error ? error.message : String(error);
     }
   }
 
-  /** Show on the buttons whether they enter or leave. */
+  /** Show on each button whether it enters or leaves a session. */
   private showState(): void {
     for (const [k, { mode, name, hint }] of MODES.entries()) {
       const isOn = this.mode === mode;
@@ -160,20 +160,20 @@ export class Headset {
     this.pointer.group.visible = false;
     renderer.xr.enabled = false;
     controls.enabled = true;
-    // The target has followed the creature.
+    // Move the camera along with its target, which has followed the creature.
     camera.position.copy(controls.target).add(this.eyeOffset);
     camera.lookAt(controls.target);
     this.stage.setMode(undefined);
     this.showState();
   }
 
-  /** Place the creature in front of the user, who sees the side of it that the page has shown. */
+  /** Place the creature in front of the user, with the same side towards the user as on the page. */
   private placeInFront(frame: XRFrame, base: XRReferenceSpace): void {
     const viewer = frame.getViewerPose(base);
     if (viewer === undefined) return;
     const { position, orientation } = viewer.transform;
     const forward = new THREE.Vector3(0, 0, -1).applyQuaternion(quaternionOf(orientation)).setY(0);
-    // Someone who looks straight down has no direction.
+    // A user who looks straight down has no horizontal direction of view.
     if (forward.length() < 1e-3) forward.set(0, 0, -1);
     forward.normalize();
     const yaw = Math.atan2(forward.z, -forward.x) - Math.atan2(this.eyeOffset.y, this.eyeOffset.x);
@@ -183,7 +183,7 @@ export class Headset {
     this.standAt(new THREE.Vector3(position.x, 0, position.z).addScaledVector(forward, distance));
   }
 
-  /** Place the creature on the first surface of the room that is known in front of the user. */
+  /** Place the creature on the first surface that is detected in front of the user. */
   private placeOnHit(frame: XRFrame, hits: XRHitTestSource, base: XRReferenceSpace): void {
     for (const result of frame.getHitTestResults(hits)) {
       const hit = result.getPose(base)?.transform;
@@ -204,11 +204,11 @@ export class Headset {
       const hits = await session.requestHitTestSource({ space });
       if (this.session === session) this.hits = hits;
     } catch {
-      // Without hit tests the creature stands on the floor of the reference space.
+      // Without hit tests, the creature stands on the floor of the reference space.
     }
   }
 
-  /** Let the creature stand at a point of `base`. */
+  /** Place the creature at a point of `base`. */
   private standAt(place: THREE.Vector3): void {
     const { pose } = this;
     if (pose === undefined) return;
@@ -229,7 +229,7 @@ export class Headset {
     this.stage.renderer.xr.setReferenceSpace(this.base.getOffsetReferenceSpace(offset));
   }
 
-  /** Return the point of the floor to which an input source points, in the axes of the scene. */
+  /** Return the point of the floor at which an input source points, in the axes of the scene. */
   private floorPoint(frame: XRFrame, source: XRInputSource): THREE.Vector3 | undefined {
     const ray = this.rayOf(frame, source);
     const { standPoint, height } = this.stage;
@@ -251,7 +251,7 @@ export class Headset {
   private select({ frame, inputSource }: XRInputSourceEvent): void {
     const point = this.floorPoint(frame, inputSource);
     if (point === undefined || this.pose === undefined) return;
-    // From now on the user decides where the creature stands.
+    // After this, only the user moves the creature.
     this.hits?.cancel();
     this.hits = undefined;
     if (this.onFloor !== undefined) this.onFloor(point);
@@ -259,7 +259,7 @@ export class Headset {
     else this.shift(this.headPosition().sub(point));
   }
 
-  /** Return the middle between the eyes; the camera of three.js for both is behind them. */
+  /** Return the midpoint between the eyes; the combined camera of three.js is behind them. */
   private headPosition(): THREE.Vector3 {
     const { cameras } = this.stage.renderer.xr.getCamera();
     const head = new THREE.Vector3();
@@ -272,7 +272,7 @@ export class Headset {
     if (point !== undefined) this.grab = { source: inputSource, point };
   }
 
-  /** Show the ray of the first controller that points at the floor, and a ring there. */
+  /** Show the ray of the first controller that points at the floor, and a ring where it meets the floor. */
   private showPointer(frame: XRFrame): void {
     const { group, ring, line } = this.pointer;
     group.visible = false;
@@ -293,7 +293,7 @@ function quaternionOf({ x, y, z, w }: DOMPointReadOnly): THREE.Quaternion {
   return new THREE.Quaternion(x, y, z, w);
 }
 
-/** Create the ray of a controller, and a ring of 10 cm where it meets the floor. */
+/** Create the ray of a controller, and a ring of 10 cm for the point where it meets the floor. */
 function createPointer(): { group: THREE.Group; ring: THREE.Mesh; line: THREE.Line } {
   const look = { color: POINTER_COLOUR, depthTest: false, transparent: true, opacity: 0.8 };
   const ring = new THREE.Mesh(

@@ -6,7 +6,7 @@ import type { Viewer } from "./viewer";
 
 export type Action = "forward" | "back" | "left" | "right" | "jump" | "leap" | "hop";
 
-/** Return the motion of an action; a body that can walk walks, any other body hops. */
+/** Return the script text of an action; a body that can walk walks, any other body hops. */
 export function motionText(action: Action, walks: boolean): string {
   return {
     forward: walks ? "walk 0.2" : "hop 0.4 0.2",
@@ -19,8 +19,8 @@ export function motionText(action: Action, walks: boolean): string {
   }[action];
 }
 
-/** Driving speeds while a key is held: forward in sqrt(g H), turn in rad per sqrt(H / g). A slower body moves as fast
- * as it can. */
+/** Driving speeds while a key is held: forward in sqrt(g H), turn in rad per sqrt(H / g). A slower body moves at its
+ * maximum speed. */
 const DRIVES: Partial<Record<Action, { forward?: number; turn?: number }>> = {
   forward: { forward: 0.3 },
   back: { forward: -0.3 },
@@ -79,7 +79,7 @@ export class InputControls {
 
   release(source: string): void {
     if (this.pressed?.source !== source) return;
-    // Cancel the repeated motions that were requested by holding the key.
+    // Cancel the repetitions that were requested while the key was held.
     if (this.pressed.isRepeating) this.source.send({ type: this.driveFor(this.pressed.action) ? "drive" : "cancel" });
     this.pressed = undefined;
   }
@@ -149,7 +149,8 @@ export class InputControls {
   }
 }
 
-/** Pointer on the canvas: dragging the creature pulls it, clicking it pushes it, clicking the ground sends it there. */
+/** Pointer on the canvas: dragging the creature pulls it, clicking it pushes it, and clicking the ground sends it to
+ * that point. */
 export class Pointer {
   /** Grabbed node and the point to which it is pulled. */
   grab: { node: number; target: THREE.Vector3 } | undefined;
@@ -166,7 +167,7 @@ export class Pointer {
   ) {
     const { canvas } = viewer;
     const container = canvas.parentElement as HTMLElement;
-    // Capture the event before the camera controls receive it.
+    // Handle the event before the camera controls receive it.
     container.addEventListener("pointerdown", (event) => this.down(event), { capture: true });
     canvas.addEventListener("pointermove", (event) => this.move(event));
     for (const end of ["pointerup", "pointercancel"] as const) canvas.addEventListener(end, (event) => this.up(event));

@@ -1,8 +1,8 @@
-// Sheet that lists the keys and the uses of the pointer.
+// Overview of the keys and of the pointer's functions.
 
 import { element } from "./dom";
 
-/** Create a hidden sheet; each entry has the keys or gestures and what they do. */
+/** Create a hidden sheet. Each entry has keys or gestures and a description of their function. */
 export function createKeySheet(entries: [string[], string][]): HTMLElement {
   const list = element("dl", { class: "keys" });
   for (const [keys, what] of entries) {

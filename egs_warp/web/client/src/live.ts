@@ -15,11 +15,11 @@ import type { Viewer } from "./viewer";
 type State = Extract<News, { type: "state" }>;
 /** Duration of the flash of a button whose key was pressed, ms. */
 const FLASH_TIME = 400;
-/** Time within which the session reports a request that changes something, ms. */
+/** Maximum time between a request that changes the state and the session's report of it, ms. */
 const MAX_ANSWER_TIME = 5000;
 /** Default sag of a body, rho g H / E. */
 const DEFAULT_SAG = 0.05;
-/** Below this fraction of real time the speed is displayed. */
+/** Fraction of real time below which the speed is displayed. */
 const MIN_REAL_TIME_SPEED = 0.95;
 const HELP: [string[], string][] = [
   [["\u2191", "W"], "forward"],
@@ -153,7 +153,7 @@ export class Live {
       for (const end of ["pointerup", "pointerleave", "pointercancel"]) {
         created.addEventListener(end, () => this.input.release(title));
       }
-      // The button was activated by the keyboard.
+      // Clicks without a pointer event come from the keyboard.
       created.addEventListener("click", (event) => {
         if (event.detail !== 0) return;
         this.input.press(action, title);
@@ -192,7 +192,7 @@ export class Live {
     return [dock, this.settingsSheet, this.helpSheet, this.toasts.element];
   }
 
-  /** Advance by `elapsed` wall-clock seconds; return true if the shown time has changed. */
+  /** Advance by `elapsed` wall-clock seconds; return true if the displayed time has changed. */
   advance(elapsed: number): boolean {
     this.input.tick();
     this.pushTool.tick();
@@ -214,7 +214,7 @@ export class Live {
     this.updateNextLabel();
   }
 
-  /** Show at once that a request was made: the session answers only after its step. */
+  /** Show immediately that a request was made, because the session reports it only after its step. */
   private showRequest(motion: string, action?: Action): void {
     this.sent = { motion, since: performance.now() };
     this.updateNextLabel();

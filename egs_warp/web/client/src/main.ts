@@ -8,7 +8,7 @@ import "./style.css";
 
 const LOADING = "Loading\u2026";
 
-/** Return the runs of this page: embedded in it, sent by a socket, or files on the server. */
+/** Return the runs of this page: embedded in it, from a socket, or files on the server. */
 async function findRuns(): Promise<FrameSource[]> {
   const embedded = [...document.querySelectorAll<HTMLElement>("script[data-run]")];
   if (embedded.length > 0) return Promise.all(embedded.map(fromElement));
@@ -23,7 +23,7 @@ async function findRuns(): Promise<FrameSource[]> {
   return Promise.all(Array.from({ length: count }, (_, k) => fromAddress(`run/${k}`)));
 }
 
-/** Show why the connection is lost; undefined means that it is restored. */
+/** Show why the connection is lost; undefined means that it has been restored. */
 function showConnection(reason: string | undefined): void {
   if (window.egs === undefined) {
     showMessage(reason ?? LOADING);

@@ -1,4 +1,4 @@
-// Colours of splats by the picked object to which they belong.
+// Colours of splats that depend on the picked object to which they belong.
 
 export const MARK_GLSL = /* glsl */ `
 /* Colour c of a splat: lit if it belongs to the object number lit, darker for another object, dim for none. Nothing

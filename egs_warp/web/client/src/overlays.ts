@@ -9,12 +9,12 @@ import { WideLines } from "./wide_lines";
 export type Layer = "cage" | "muscles" | "feet" | "contacts" | "path";
 
 type Tint = keyof typeof LAYER_COLOURS;
-/** Colours in linear RGB, in which Three.js blends. */
+/** Colours in linear RGB, the space in which three.js blends. */
 const COLOURS = Object.fromEntries(
   Object.entries(LAYER_COLOURS).map(([name, hex]) => [name, new THREE.Color(hex).toArray()]),
 ) as Record<Tint, [number, number, number]>;
 const CONE_SIDES = 14;
-/** Length of an arrow of one body weight, in body heights. */
+/** Length of an arrow for a force of one body weight, in body heights. */
 const WEIGHT_LENGTH = 0.5;
 
 export class Overlays {
@@ -114,7 +114,7 @@ export class Overlays {
       lines.set(this.ends.subarray(3 * segments[k]!, 3 * segments[k]! + 3), 3 * k);
       const level = (frame.activations[k >> 1] ?? 0) / 127;
       const towards = level > 0 ? COLOURS.contracts : COLOURS.extends;
-      // Small activations are visible, too.
+      // The exponent makes small activations visible, too.
       const strength = Math.abs(level) ** 0.4;
       for (let c = 0; c < 3; c++) {
         colours[3 * k + c] = COLOURS.relaxed[c]! + strength * (towards[c]! - COLOURS.relaxed[c]!);

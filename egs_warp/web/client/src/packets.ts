@@ -15,7 +15,7 @@ export interface Facts {
   height: number;
   weight: number;
   friction: number;
-  /** Horizontal unit vector in which the body at rest faces. */
+  /** Horizontal unit vector of the front of the body at rest. */
   front: [number, number];
   /** True if the ground is the plane z = 0. */
   flat: boolean;
@@ -26,21 +26,21 @@ export interface Facts {
   motion: { name: string; reached?: Record<string, number> }[];
   notes: string[];
   degree: { splats: number; scene: number };
-  /** Largest stretch of an arm of a splat relative to the material at its two ends. */
+  /** Maximum stretch of an arm of a splat relative to the stretch of the material at its two ends. */
   max_stretch: number;
   /** True if the capture was trained with antialiasing. */
   antialiased: boolean;
-  /** Main light of the capture: direction to it, fraction of the ground's brightness that its shadow removes, and the
-   * quadratic form of the irradiance, sixteen numbers. */
+  /** Main light of the capture: direction to the light, fraction of the ground's brightness that its shadow removes,
+   * and quadratic form of the irradiance (sixteen numbers). */
   light?: MainLight;
   /** True for the still capture that is shown while its creature is prepared. */
   preparing?: boolean;
-  /** True for a capture whose objects are picked. */
+  /** True for a capture in which the user picks objects. */
   picking?: boolean;
-  /** Only for live sessions: identifier of the session and limits of its sliders. */
+  /** Identifier of the session and limits of its sliders; only for live sessions. */
   session?: string;
   limits?: { friction: [number, number]; sag: [number, number]; style: [number, number] };
-  /** Named styles. */
+  /** Named styles of jumps. */
   styles?: Record<string, Style>;
 }
 
@@ -50,7 +50,7 @@ export interface MainLight {
   irradiance: number[];
 }
 
-/** Style of a jump; each value is a factor on the default (egs_warp/motions/style.py). */
+/** Style of a jump; each value multiplies a default value (egs_warp/motions/style.py). */
 export interface Style {
   anticipation: number;
   squash: number;
@@ -84,7 +84,7 @@ interface ArrayEntry {
   start: number;
 }
 
-/** Read the header at the start of `bytes`; `end` is the offset of the first frame. */
+/** Read the header at the start of `bytes`; `end` is the offset of the first frame in bytes. */
 export function readHeader(bytes: ArrayBuffer): { header: Header; end: number } {
   const dataView = new DataView(bytes);
   const text = new TextDecoder();
@@ -115,7 +115,7 @@ function view(type: string, bytes: ArrayBuffer, start: number, count: number): N
   }
 }
 
-/** Read one frame; `start` is a multiple of four. */
+/** Read one frame; its offset `start` must be a multiple of four. */
 export function readFrame(bytes: ArrayBuffer, start: number): Frame {
   const words = new Uint32Array(bytes, start, 8);
   const counts = [words[2], words[3], words[4], words[5]] as [number, number, number, number];

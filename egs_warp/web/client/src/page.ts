@@ -14,7 +14,7 @@ import { LiveSource, type FrameSource } from "./frame_source";
 import { Viewer, type Preset, type LayerToggle } from "./viewer";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
-/** Time per image above which the resolution is reduced, s: for a recorded run and for a live session. */
+/** Maximum time per image before the resolution is reduced, s: for a recorded run and for a live session. */
 const MAX_FRAME_TIME = 1 / 15;
 const MAX_LIVE_FRAME_TIME = 1 / 25;
 const LAYERS: { name: LayerToggle; title: string; on: boolean; key: string }[] = [
@@ -33,7 +33,7 @@ const PRESETS: { name: Preset; title: string; hint: string }[] = [
   { name: "side", title: "Side", hint: "Look at the left side of the body" },
   { name: "top", title: "Top", hint: "Look from above" },
 ];
-/** Keys of a recorded run; a live session has its own. */
+/** Keys of a recorded run; a live session has different keys. */
 const HELP: [string[], string][] = [
   [["Space"], "play or pause"],
   [["\u2190", "\u2192"], "one frame back or forward"],
@@ -50,9 +50,9 @@ const HELP: [string[], string][] = [
 export class Page {
   readonly viewers: Viewer[] = [];
   readonly player: Player;
-  /** Only for live sessions. */
+  /** Controls of a live session; undefined for recorded runs. */
   readonly live: Live | undefined;
-  /** Only where objects are picked. */
+  /** Controls of the page on which objects are picked; undefined on other pages. */
   readonly pick: Pick | undefined;
   private readonly charts: Charts;
   private readonly legend: Legend;
@@ -67,7 +67,7 @@ export class Page {
   constructor(root: HTMLElement, sources: FrameSource[]) {
     const film = {
       rate: (sources[0] as FrameSource).header.facts.rate,
-      // Shorter runs stay at their last frame.
+      // A shorter run stays at its last frame.
       get lastFrame(): number {
         return Math.max(...sources.map((source) => source.frames.length)) - 1;
       },
@@ -115,7 +115,7 @@ export class Page {
     const isStill = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.player.playing = this.live === undefined && this.player.lastFrame > 0 && !isStill;
     this.update();
-    // In a headset the images are those of its session.
+    // In a headset, this is the animation loop of its session.
     this.first.renderer.setAnimationLoop((now) => this.animate(now));
   }
 
@@ -128,7 +128,7 @@ export class Page {
     this.update();
   }
 
-  /** The viewer that headsets and videos show. */
+  /** The viewer whose content headsets and videos show. */
   private get first(): Viewer {
     return this.viewers[0]!;
   }
@@ -199,7 +199,7 @@ export class Page {
       button("curves", "Curves (c)", () => this.toggleCurves()),
       button("camera", this.live === undefined ? "Screenshot (s)" : "Screenshot", () => void this.screenshot()),
       record,
-      // Two runs side by side have no common place in a room, and a prepared creature gets a page of its own.
+      // Two runs side by side have no common position in a room, and a prepared creature gets a page of its own.
       ...(this.viewers.length > 1 || this.first.source.header.facts.preparing ? [] : this.first.headset.buttons),
       ...(this.live === undefined ? [button("help", "Keys (?)", () => this.toggleKeys())] : []),
       layers,
@@ -283,7 +283,7 @@ export class Page {
     event.preventDefault();
   }
 
-  /** Reduce the resolution during playback if the machine is too slow. */
+  /** Reduce the resolution if the machine is too slow for playback. */
   private adaptResolution(elapsed: number): void {
     if (this.recorder.recording) return;
     if (this.live === undefined ? !this.player.playing : !this.live.isMoving) {
@@ -305,8 +305,8 @@ export class Page {
     this.bar.update();
   }
 
-  /** True if a slow machine must wait until its splats are sorted. In an outdated order the ground would hide the
-   * body. */
+  /** True if the next image must wait for the sorting of the splats on a slow machine. With an outdated order, the
+   * ground would hide the body. */
   private get isWaitingForSort(): boolean {
     return this.player.playing && this.frameTime > MAX_FRAME_TIME && this.viewers.some((viewer) => viewer.sorting);
   }

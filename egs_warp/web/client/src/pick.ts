@@ -1,4 +1,4 @@
-// Page of egs-warp pick: marks, objects, ground and front, and the commands that go on from there.
+// Page of egs-warp pick: marks, objects, ground, front, and buttons for the commands that use the picked object.
 
 import { button, element, type Icon } from "./dom";
 import { createKeySheet } from "./key_sheet";
@@ -33,7 +33,7 @@ export class Pick {
   body: BodyNews | undefined;
   /** Latest progress of each command. */
   readonly jobs = new Map<string, JobNews>();
-  /** What the session is doing; empty if it waits. */
+  /** Current work of the session; empty while it is idle. */
   work = "";
   /** All messages to the user, the newest last. */
   readonly messages: string[] = [];
@@ -127,7 +127,7 @@ export class Pick {
     this.buttons.brush.setAttribute("aria-pressed", String(on));
   }
 
-  /** Send a click or stroke at positions of the canvas, and show at once that it was made. */
+  /** Send a click or stroke at positions of the canvas, and show immediately that it was made. */
   private mark(pixels: [number, number][], inside: boolean): void {
     const { camera, controls, canvas } = this.viewer;
     for (const [x, y] of pixels) this.ping(x, y, inside);

@@ -6,7 +6,7 @@ import { WideLines } from "./wide_lines";
 
 export type Handle = "up" | "front" | "ground";
 
-/** Components are sRGB values, which the shader writes unchanged. */
+/** Colours of the handles; components are sRGB values, which the shader writes unchanged. */
 const COLOURS: Record<Handle, Vector> = {
   up: [0.5, 0.82, 0.72],
   front: [1, 0.76, 0.29],
@@ -15,7 +15,7 @@ const COLOURS: Record<Handle, Vector> = {
 /** Lengths in sizes of the object. */
 const GRID_HALF = 0.8;
 const GRID_LINES = 9;
-/** Segments of a line of the grid on uneven ground. */
+/** Number of segments in a grid line on uneven ground. */
 const GRID_SEGMENTS = 32;
 const REACH: Record<Handle, number> = { up: 0.95, front: 0.85, ground: 0.9 };
 /** Half of a handle's cross, relative to the size of the object. */
@@ -39,14 +39,14 @@ export class PickGizmos {
     this.group.add(this.grid.object, this.arrows.object);
   }
 
-  /** Offset of the ground n.x + d = 0. */
+  /** Offset d of the ground n.x + d = 0. */
   get offset(): number {
     return -this.normal.dot(this.anchor);
   }
 
   show(state: PickState): void {
     const normal = new THREE.Vector3(state.plane[0], state.plane[1], state.plane[2]);
-    // The heights of another object, or over another plane, do not apply.
+    // Heights of another object, or over another plane, are not valid here.
     if (state.active !== this.active || normal.distanceTo(this.normal) > 1e-6) this.ground = null;
     this.active = state.active;
     this.normal.copy(normal);
@@ -62,7 +62,7 @@ export class PickGizmos {
     this.draw();
   }
 
-  /** Return the height of the ground over its plane at `point`, between the nodes bilinearly. */
+  /** Return the height of the ground over its plane at `point`, interpolated bilinearly between the nodes. */
   private heightAt(point: THREE.Vector3): number {
     const { ground } = this;
     if (ground === null) return 0;
@@ -78,7 +78,7 @@ export class PickGizmos {
     return (1 - t) * near + t * ((1 - s) * at(row + 1, column) + s * at(row + 1, column + 1));
   }
 
-  /** Show the given or estimated front; null if there is none yet. */
+  /** Show the given or estimated front; null hides the arrow until there is one. */
   showFront(front: Vector | null): void {
     this.hasFront = front !== null;
     if (front !== null) this.front.set(...front);
@@ -98,7 +98,7 @@ export class PickGizmos {
     return found;
   }
 
-  /** Return the front along the ground. */
+  /** Return the direction of the front along the ground. */
   private ahead(): THREE.Vector3 {
     const ahead = this.front.clone().projectOnPlane(this.normal);
     if (ahead.length() > 1e-3) return ahead.normalize();
@@ -111,7 +111,7 @@ export class PickGizmos {
     if (handle === "up") {
       const nearest = new THREE.Vector3();
       const sphere = new THREE.Sphere(anchor, REACH.up * size);
-      // Beside the sphere, the nearest point of the ray gives the direction.
+      // If the ray misses the sphere, the nearest point of the ray gives the direction.
       if (ray.intersectSphere(sphere, nearest) === null) ray.closestPointToPoint(anchor, nearest);
       const direction = nearest.sub(anchor);
       if (direction.length() > 1e-6) normal.copy(direction.normalize());
@@ -122,7 +122,7 @@ export class PickGizmos {
       if (direction !== undefined && direction.length() > 1e-6) this.front.copy(direction.normalize());
     } else {
       const start = this.handles().get("ground") as THREE.Vector3;
-      // The point of the line through the handle along the normal that is nearest to the ray.
+      // The target is the point nearest to the ray on the line through the handle along the normal.
       const across = ray.direction.dot(normal);
       const between = start.clone().sub(ray.origin);
       const scale = 1 - across * across;
@@ -166,7 +166,7 @@ export class PickGizmos {
       if (tip === undefined) continue;
       const along = tip.clone().sub(anchor).normalize();
       add(handle, anchor, tip);
-      // Four barbs, so that the head is visible from every side.
+      // Draw four barbs, so that the head is visible from every side.
       for (const aside of [side, handle === "up" ? ahead : normal]) {
         for (const sign of [1, -1]) {
           const barb = tip.clone().addScaledVector(along, -HEAD_SIZE * size);

@@ -13,7 +13,7 @@ export interface PickState {
   anchor: Vector;
   /** Diagonal of the object. */
   size: number;
-  /** Front that the user has given. */
+  /** Front that the user has set; null if there is none. */
   front: Vector | null;
   undo: boolean;
   redo: boolean;
@@ -27,7 +27,7 @@ export interface BodyNews {
   type: "body";
   measuring?: boolean;
   rows: [string, string][];
-  /** Motions, and why the body cannot perform one. */
+  /** Motions, and for each impossible one the reason. */
   motions: { name: string; why: string | null }[];
   /** Given or estimated front. */
   front: Vector | null;
@@ -41,12 +41,12 @@ export interface GroundGrid {
   first: Vector;
   second: Vector;
   spacing: number;
-  /** Number of columns, and of rows. */
+  /** Number of columns and of rows. */
   count: number;
   heights: number[];
 }
 
-/** Progress of a command that the page has started; it may serve a page of its own. */
+/** Progress of a command that the page has started. Such a command may serve its own page. */
 export interface JobNews {
   type: "animate" | "live";
   text: string;

@@ -1,4 +1,4 @@
-// Panel of the page of egs-warp pick: objects, size, feet and motions of the active one, and the commands.
+// Panel of the page of egs-warp pick: the objects; size, feet and motions of the active object; and the commands.
 
 import { button, element } from "./dom";
 import type { BodyNews, JobNews, PickState } from "./pick_news";

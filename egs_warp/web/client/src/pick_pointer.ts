@@ -1,14 +1,15 @@
-// Pointer of the page of egs-warp pick: clicks and strokes mark, handles are dragged, other drags turn the camera.
+// Pointer of the page of egs-warp pick: clicks and strokes mark objects, handles can be dragged, and other drags turn
+// the camera.
 
 import type { Handle, PickGizmos } from "./pick_gizmos";
 import type { Viewer } from "./viewer";
 
-/** Movement in pixels from which a press is a drag and not a click. */
+/** Minimum movement, in pixels, of a press that is a drag instead of a click. */
 const MAX_CLICK_MOVE = 5;
 /** Distance in pixels within which a handle is grabbed, with a mouse and with a finger. */
 const GRAB_REACH = 16;
 const TOUCH_REACH = 30;
-/** Pixels between two points of a stroke, and the maximum number of points that are sent. */
+/** Distance between two points of a stroke, pixels, and maximum number of points that are sent. */
 const STROKE_STEP = 6;
 const MAX_STROKE_POINTS = 12;
 
@@ -18,7 +19,7 @@ export interface PointerActions {
 }
 
 export class PickPointer {
-  /** True if a drag marks instead of turning the camera. */
+  /** True if a drag marks the object instead of turning the camera. */
   isBrush = false;
   private start: { x: number; y: number; id: number } | undefined;
   private handle: Handle | undefined;
@@ -38,7 +39,7 @@ export class PickPointer {
     const { canvas } = viewer;
     const container = canvas.parentElement as HTMLElement;
     container.append(this.overlay);
-    // Capture the event before the camera controls receive it.
+    // Handle the event before the camera controls receive it.
     container.addEventListener("pointerdown", (event) => this.down(event), { capture: true });
     canvas.addEventListener("pointermove", (event) => this.move(event));
     for (const end of ["pointerup", "pointercancel"] as const) canvas.addEventListener(end, (event) => this.up(event));
@@ -71,7 +72,7 @@ export class PickPointer {
   private down(event: PointerEvent): void {
     if (event.target !== this.viewer.canvas) return;
     if (!event.isPrimary) {
-      // A second finger moves the camera: it ends the stroke.
+      // A second finger moves the camera, so the stroke is cancelled.
       this.cancel();
       return;
     }

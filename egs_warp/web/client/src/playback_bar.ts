@@ -13,7 +13,7 @@ interface BarOptions {
   hasLoop?: boolean;
 }
 
-/** Bar that shows and controls a player; its user calls `update` when the player has changed. */
+/** Bar that shows and controls a player; its owner calls `update` when the player has changed. */
 export class PlaybackBar {
   readonly element: HTMLElement;
   private readonly playButton: HTMLButtonElement;

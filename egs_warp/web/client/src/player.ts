@@ -1,6 +1,6 @@
 // Playback state of recorded runs.
 
-/** What is played: its last frame, and its frames per second. */
+/** Properties of the played film: its last frame, and its frames per second. */
 export interface Film {
   readonly lastFrame: number;
   readonly rate: number;
@@ -50,7 +50,7 @@ export class Player {
   /** Advance the playback by `elapsed` seconds. */
   advance(elapsed: number): void {
     if (!this.playing) return;
-    // Limit the step, so that a tab that was in the background continues where it stopped.
+    // Limit the step, so that a tab that was in the background continues at the frame where it stopped.
     this.framePosition += Math.min(elapsed, 0.25) * this.rate * this.speed;
     if (this.framePosition >= this.lastFrame) {
       if (this.loop && this.lastFrame > 0) this.framePosition %= this.lastFrame;

@@ -10,7 +10,7 @@ import type { Viewer } from "./viewer";
 const RING_TIME = 0.35;
 
 export class PushTool {
-  /** Impulse in m sqrt(g H). */
+  /** Impulse of a push, in units of body mass times sqrt(g H). */
   strength = 0.15;
   private readonly rest: Float32Array;
   private lastPush: { where: () => THREE.Vector3; since: number } | undefined;
@@ -44,7 +44,8 @@ export class PushTool {
     this.viewer.invalidate();
   }
 
-  /** Return the camera's horizontal viewing direction; from straight above, the up direction of the image. */
+  /** Return the horizontal viewing direction of the camera or, if it looks straight down, the up direction of the
+   * image. */
   private pushDirection(): THREE.Vector3 {
     const { camera } = this.viewer;
     const flat = (direction: THREE.Vector3): THREE.Vector3 => direction.setZ(0);

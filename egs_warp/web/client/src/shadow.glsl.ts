@@ -1,4 +1,4 @@
-// Light that reaches the ground under the creature, for the floor and for a captured ground.
+// Fraction of light that reaches the ground under the creature, for the floor and for a captured ground.
 
 /** Radius of the wide part of the shadow, as a fraction of the side of the shadow map. */
 export const WIDE_RADIUS = 0.08;
@@ -7,7 +7,7 @@ const GOLDEN_ANGLE = 2.399963;
 const NEAR_SAMPLES = 6;
 const WIDE_SAMPLES = 10;
 
-/** Offset of sample k on a disc of radius 1; the fraction (k + 0.5) / count of the disc's area is further inside. */
+/** Offset of sample k on a disc of radius 1; the fraction (k + 0.5) / count of the disc's area is inside its radius. */
 function discOffset(k: number, count: number): string {
   const radius = Math.sqrt((k + 0.5) / count);
   const [x, y] = [radius * Math.cos(GOLDEN_ANGLE * k), radius * Math.sin(GOLDEN_ANGLE * k)];

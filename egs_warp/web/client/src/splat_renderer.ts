@@ -1,6 +1,6 @@
 // Spark with shaders that use the opacity cut, low-pass filter and clipping of our own renderer
 // (docs/concepts/renderer.md). Many splats share one instance, because the cost of an instance hardly depends on its
-// size; in a software rasteriser an instance costs a hundred times more than one splat.
+// size. In a software rasteriser, an instance costs a hundred times more than one splat.
 
 import { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
@@ -145,7 +145,7 @@ export function splatRenderer(
   const setUniforms = spark.onBeforeRender.bind(spark);
   spark.onBeforeRender = (...parameters) => {
     setUniforms(...parameters);
-    // Spark measures the whole image of a headset, in which each eye has a part.
+    // Spark uses the size of a headset's whole image, of which each eye has a part.
     const { viewport } = parameters[2] as THREE.PerspectiveCamera & { viewport?: THREE.Vector4 };
     if (viewport !== undefined) (spark.uniforms.renderSize.value as THREE.Vector2).set(viewport.z, viewport.w);
   };

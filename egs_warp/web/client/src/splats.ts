@@ -15,22 +15,23 @@ export interface SplatData {
   /** Standard deviations. */
   scales: Float32Array;
   opacities: Float32Array;
-  /** Colours without the bands above 0. */
+  /** Colours of SH band 0. */
   colours: Float32Array;
   degree: number;
-  /** Coefficients of the bands above 0 in steps, plus 128, three per coefficient: each coefficient of each splat. */
+  /** Coefficients of the SH bands above 0 as bytes, 128 plus a number of steps; the three colours of each coefficient
+   * of each splat in turn. */
   bands: Uint8Array;
-  /** 127 steps of each coefficient. */
+  /** Value of 127 steps for each coefficient. */
   bandScales: Float32Array;
 }
 
-/** What moves each splat with a cage (Eq. 14). */
+/** Deformation data of each splat in a cage (Eq. 14). */
 export interface Embedding {
   /** Tetrahedron t of the mean, or -1 - t for a splat with a row of `arms`. */
   meanTets: Int32Array;
   /** Fifteen numbers per row: tetrahedra and shares of the six arms, and three smoothing lengths. */
   arms: Float32Array;
-  /** Largest stretch of an arm relative to the material at its two ends. */
+  /** Maximum stretch of an arm relative to the stretch of the material at its two ends. */
   maxStretch: number;
 }
 
@@ -38,11 +39,11 @@ export interface DeformedSplats {
   generator: SplatGenerator;
   /** Regenerate the splats after the cage has changed. */
   update(): void;
-  /** Light up the splats of an object and dim those of none; only for splats with `hasMarks`. */
+  /** Brighten the splats of an object and dim splats of no object; only for splats with `hasMarks`. */
   mark(labels: Uint8Array, active: number): void;
 }
 
-/** Change of the colours as the splats turn in the main light. */
+/** Change of the colours as the splats rotate in the main light. */
 export interface Relighting {
   /** Quadratic form of the irradiance, sixteen numbers. */
   irradiance: number[];
@@ -57,11 +58,11 @@ interface SplatOptions {
   relighting?: Relighting | undefined;
 }
 
-/** Create splats that are deformed by the maps in `cage`, and placed by their `generator`.
+/** Create splats that are deformed by the maps in `cage` and placed by their `generator`.
  *
  * Without an `embedding` they are static, and all use the first tetrahedron. A `shadow` darkens the splats near the
  * ground. With `hasMarks`, the colour of a splat depends on the object to which it belongs. With `relighting`, the
- * colour of a splat changes with its normal, which turns with the cage. */
+ * colour of a splat depends on its normal, which rotates with the cage. */
 export function deformedSplats(
   data: SplatData,
   cage: THREE.DataTexture,
@@ -103,7 +104,7 @@ export function deformedSplats(
     eye: dyno.dynoVec3(eye, "egsEye"),
     place: dyno.dynoMat4(place, "egsPlace"),
     normals: dyno.dynoSampler2D(relighting ? normalTexture(relighting.normals) : cage, "egsNormals"),
-    // Zero without a main light.
+    // The irradiance is zero without a main light.
     irradiance: dyno.dynoMat4(
       new THREE.Matrix4().fromArray(relighting?.irradiance ?? new Array<number>(16).fill(0)),
       "egsIrradiance",

@@ -1,4 +1,4 @@
-// Picture of splats on their ground, on one canvas: renderer, camera, and when an image is drawn.
+// Picture of splats on their ground, on one canvas: renderer, camera, and the decision when to draw an image.
 
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
@@ -17,7 +17,7 @@ export interface StageOptions {
   /** Triangles of the surface that casts the shadow, and the number of its nodes. */
   surface: Int32Array;
   nodeCount: number;
-  /** Main light of the capture; undefined where it is not clear. */
+  /** Main light of the capture; undefined if it is not clear. */
   light?: MainLight | undefined;
 }
 
@@ -36,7 +36,7 @@ export abstract class Stage {
   readonly height: number;
   /** Vertical field of view of the film, degrees. */
   protected fov = 30;
-  /** Kind of the session of a headset; undefined on the page. */
+  /** Mode of the headset's session; undefined on the page. */
   protected mode: XRSessionMode | undefined;
   private readonly splatRenderer: SplatRenderer;
   /** Fraction of the canvas resolution along each side; reduced on slow machines. */
@@ -75,7 +75,7 @@ export abstract class Stage {
   /** Show the surroundings for `mode`. In augmented reality there is only the shadow on the real floor. */
   protected abstract showSurroundings(): void;
 
-  /** Change to the surroundings of a headset, or back to those of the page. */
+  /** Switch to the surroundings of a headset, or back to the page's surroundings. */
   setMode(mode: XRSessionMode | undefined): void {
     this.mode = mode;
     this.ground.shadowMesh.visible = mode === "immersive-ar";
@@ -90,7 +90,7 @@ export abstract class Stage {
 
   resize(): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
-    // A headset has a size and a projection of its own.
+    // During a session, a headset sets the size and the projection.
     if (width === 0 || height === 0 || this.headset.isPresenting) return;
     this.renderer.setPixelRatio(this.resolution * Math.min(window.devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);

@@ -1,10 +1,10 @@
-// Style of jumps: buttons of the named styles, and a slider for each parameter.
+// Panel for the style of jumps: buttons of the named styles, and a slider for each parameter.
 
 import { element } from "./dom";
 import type { Facts, Style } from "./packets";
 import { createSlider, type Slider } from "./slider";
 
-/** Resolution of the parameters. */
+/** Step of the sliders of the parameters. */
 const STEP = 0.05;
 const FIELDS: [keyof Style, string, string][] = [
   ["anticipation", "Anticipation", "Depth and duration of the crouch before a jump"],

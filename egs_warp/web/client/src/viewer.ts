@@ -7,13 +7,13 @@ import { bytesOf, embeddingOf, floatsOf, indicesOf, splatsOf, type Frame } from 
 import type { FrameSource } from "./frame_source";
 import { Stage } from "./stage";
 
-/** Fraction of the picture that the body or its run fills in the views front, side and top. */
+/** Fraction of the picture that the body or its run fills in the front, side and top views. */
 const FILL = 0.86;
-/** Height by which the ground must change before a following camera changes its height, in body heights. */
+/** Minimum change of the ground's height, in body heights, at which a following camera changes its height. */
 const GROUND_CHANGE = 0.02;
-/** Fraction of a change of the ground's height by which a following camera moves in one image. */
+/** Fraction of a change of the ground's height by which a following camera moves per image. */
 const RISE_PER_FRAME = 0.1;
-/** Half of the height that a view of the body alone shows, in body heights. */
+/** Half of the height that a view of only the body shows, in body heights. */
 const HALF_VIEW_HEIGHT = 1;
 export type Preset = "film" | "front" | "side" | "top";
 export type LayerToggle = Layer | "splats" | "scene" | "ground";
@@ -31,7 +31,7 @@ export class Viewer extends Stage {
   private readonly currentCentre = new THREE.Vector3();
   /** Height of the ground under the body that the camera follows, m. */
   private groundHeight = 0;
-  /** True for the ground and the scene if their layers are on. */
+  /** Whether the layers of the ground and of the scene are on. */
   private readonly layers = { ground: true, scene: true };
 
   constructor(
@@ -108,14 +108,14 @@ export class Viewer extends Stage {
     return this.bodies.positions;
   }
 
-  /** Move with the body along the ground, and up or down only with the ground that carries it: the camera does not
-   * follow a jump. */
+  /** Move with the body along the ground. The camera moves up or down only with the ground that supports the body, so
+   * it does not follow a jump. */
   private followBody(centre: THREE.Vector3, frame: Frame): void {
     const moved = centre.clone().sub(this.currentCentre).setZ(0);
     if (frame.contacts.length > 0) {
       let lowest = Infinity;
       for (let k = 2; k < this.positions.length; k += 3) lowest = Math.min(lowest, this.positions[k]!);
-      // Pressed soles and small bumps do not count as a change of the ground's height.
+      // Pressed soles and small bumps are no change of the ground's height.
       const rise = lowest - this.groundHeight;
       const threshold = GROUND_CHANGE * this.source.header.facts.height;
       moved.z = RISE_PER_FRAME * Math.sign(rise) * Math.max(Math.abs(rise) - threshold, 0);
@@ -128,7 +128,7 @@ export class Viewer extends Stage {
   preset(name: Preset): void {
     const { camera, height } = this.source.header.facts;
     this.fov = camera.fov;
-    // Where the camera follows, it shows the body; elsewhere, its whole run.
+    // A following camera shows the body; otherwise the camera shows its whole run.
     const isFollowing = this.follow || this.source.isOpen;
     const box = isFollowing ? new THREE.Box3().setFromArray(this.positions) : this.bounds;
     const centre = box.getCenter(new THREE.Vector3());
@@ -148,18 +148,18 @@ export class Viewer extends Stage {
     this.resize();
   }
 
-  /** Return the unit vector from the body to the camera of a view; the body may have turned since the start. */
+  /** Return the unit vector from the body to the camera of a view, for a body that may have turned since the start. */
   private direction(name: Exclude<Preset, "film">): THREE.Vector3 {
     const [ahead, left] = this.source.header.facts.front;
     const yaw = this.yaw();
     const front = new THREE.Vector3(ahead, left, 0).applyAxisAngle(this.camera.up, yaw);
-    // The side is the left: the front is at the left of the picture.
+    // The view from the side is from the left, so the front is at the left of the picture.
     const side = new THREE.Vector3(-left, ahead, 0).applyAxisAngle(this.camera.up, yaw);
     if (name === "top") return front.multiplyScalar(-1e-3).setZ(1).normalize();
     return (name === "front" ? front : side).setZ(0.12).normalize();
   }
 
-  /** Return the angle about the vertical by which the body has turned since it was at rest, in radians. */
+  /** Return the angle about the vertical by which the body has turned relative to its rest pose, rad. */
   private yaw(): number {
     const { positions, masses } = this;
     const rest = floatsOf(this.source.header, "rest");
@@ -216,7 +216,7 @@ export class Viewer extends Stage {
     });
   }
 
-  /** Light up the splats of the object `active`; `labels` has the number of the object of each splat, 0 for none. */
+  /** Brighten the splats of the object `active`; `labels` contains the number of each splat's object, 0 for none. */
   mark(labels: Uint8Array, active: number): void {
     this.bodies.mark(labels, active);
     this.invalidate();
@@ -239,7 +239,7 @@ export class Viewer extends Stage {
     return raycaster.ray;
   }
 
-  /** Return the visible surface point at a window position and the nearest node, if the body is there. */
+  /** Return the visible surface point at a window position and the nearest node; undefined if the body is not there. */
   pick(clientX: number, clientY: number): { node: number; point: THREE.Vector3 } | undefined {
     const ray = this.ray(clientX, clientY);
     const surface = indicesOf(this.source.header, "surface");
@@ -259,7 +259,7 @@ export class Viewer extends Stage {
     return nearest.node < 0 ? undefined : { node: nearest.node, point: nearest.point };
   }
 
-  /** Return the ground point at a window position, unless there is none or it is too far away. */
+  /** Return the ground point at a window position; undefined if there is none or it is too far away. */
   groundPoint(clientX: number, clientY: number): THREE.Vector3 | undefined {
     const ground = new THREE.Plane(new THREE.Vector3(0, 0, 1), 0);
     const point = this.ray(clientX, clientY).intersectPlane(ground, new THREE.Vector3());

@@ -1,11 +1,11 @@
-// Lines with a width in pixels that may change every frame, with a dark rim that separates them from any background.
+// Lines whose width in pixels may change every frame, with a dark rim that separates them from any background.
 
 import * as THREE from "three";
 import { LineMaterial } from "three/examples/jsm/lines/LineMaterial.js";
 import { LineSegments2 } from "three/examples/jsm/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/examples/jsm/lines/LineSegmentsGeometry.js";
 
-/** Width of the rim at each side of a line, pixels, and its colour and opacity. */
+/** Width of the rim on each side of a line, pixels, and the rim's colour and opacity. */
 const RIM_WIDTH = 1.25;
 const RIM_COLOUR = 0x14181f;
 const RIM_OPACITY = 0.7;
@@ -25,7 +25,7 @@ export class WideLines {
     this.parts = materials.map((material, k) => {
       const part = new LineSegments2(this.geometry, material);
       part.frustumCulled = false;
-      // The rims of all lines lie under all lines of the same order.
+      // Draw the rims of all lines below all lines of the same order.
       part.renderOrder = order + 0.1 * k;
       return part;
     });

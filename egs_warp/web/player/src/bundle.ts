@@ -1,4 +1,4 @@
-// Reader of bundles (docs/concepts/bundle.md), which are read while they arrive.
+// Reader of bundles (docs/concepts/bundle.md) that reads the data as they arrive.
 
 import type { Embedding, SplatData } from "../../client/src/splats";
 
@@ -9,7 +9,7 @@ export interface Camera {
   fov: number;
 }
 
-/** Properties of the JSON text. */
+/** Properties in the JSON text of a bundle. */
 export interface Facts {
   title?: string;
   licence?: string;
@@ -25,7 +25,7 @@ export interface Facts {
 export interface BundleCage {
   rest: Float32Array;
   tets: Int32Array;
-  /** Triangles of the surface. */
+  /** Triangles of the cage's surface. */
   surface: Int32Array;
   embedding: Embedding;
   /** Node positions of the frames that have arrived. */
@@ -36,7 +36,7 @@ export interface BundleBody {
   name: string;
   antialiased: boolean;
   splats: SplatData;
-  /** Undefined for static splats. */
+  /** Cage that moves the splats; undefined for static splats. */
   cage?: BundleCage;
 }
 
@@ -45,7 +45,7 @@ export interface Bundle {
   bodies: BundleBody[];
   /** Number of frames that have arrived for all bodies. */
   readonly available: number;
-  /** Resolves when the whole bundle has arrived, and rejects if it cannot be read to its end. */
+  /** Resolves when the whole bundle has arrived; rejects if the bundle cannot be read to its end. */
   complete: Promise<void>;
 }
 
@@ -78,10 +78,10 @@ const TYPES = { uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, flo
 const MAGIC = "EGSB";
 const VERSION = 1;
 const HEAD_BYTES = 12;
-/** Carriers of splats; see the specification. */
+/** Kinds of carriers of splats; see the specification. */
 const TET = 0;
 const RIGID = 2;
-/** First share of a splat that is moved rigidly, as deform.glsl.ts expects it. */
+/** First share of a splat that moves rigidly, as expected by deform.glsl.ts. */
 const RIGID_SHARE = 3;
 /** Number of steps of `bandScales`. */
 const BAND_STEPS = 127;
@@ -108,7 +108,7 @@ export async function readBundle(stream: ReadableStream<Uint8Array>): Promise<Bu
   const read = async (entries: Entries): Promise<Arrays> => {
     const arrays: Arrays = new Map();
     for (const [name, entry] of byOffset(entries)) {
-      // The shader reads the bands as they are stored.
+      // The shader reads the bands in their stored form.
       arrays.set(name, await numbersOf(source, name === "bands" ? { ...entry, step: undefined } : entry));
     }
     return arrays;
@@ -128,7 +128,7 @@ export async function readBundle(stream: ReadableStream<Uint8Array>): Promise<Bu
     for (let number = 1; number < count; number++) await readBlocks(number);
   };
   const complete = rest();
-  // Those who use the promise receive the error.
+  // Callers that use the promise still receive the error.
   complete.catch(() => {});
   return {
     facts,
@@ -145,19 +145,19 @@ class ByteSource {
   private readonly reader: ReadableStreamDefaultReader<Uint8Array>;
   private chunks: Uint8Array[] = [];
   private buffered = 0;
-  /** Position in the data of the next byte. */
+  /** Position of the next byte in the data. */
   private position = 0;
 
   constructor(stream: ReadableStream<Uint8Array>) {
     this.reader = stream.getReader();
   }
 
-  /** Count positions from the next byte. */
+  /** Set the position of the next byte to 0. */
   begin(): void {
     this.position = 0;
   }
 
-  /** Return the bytes of `length` at a position of the data that is not before the next byte. */
+  /** Return `length` bytes at a position of the data; the position must not be before the next byte. */
   async takeAt(position: number, length: number): Promise<Uint8Array<ArrayBuffer>> {
     if (position < this.position) throw new Error("the arrays of this bundle are not in the order of their offsets");
     if (position > this.position) await this.take(position - this.position);
@@ -205,7 +205,7 @@ async function numbersOf(source: ByteSource, entry: Entry): Promise<Stored | Flo
   for (let plane = 0; plane < rowBytes; plane++) {
     for (let k = 0; k < count; k++) bytes[k * rowBytes + plane] = planes[plane * count + k]!;
   }
-  // Typed arrays of integers compute modulo 2 to the number of their bits.
+  // Typed arrays of integers wrap around, as the encoder does.
   if (entry.delta) for (let k = components; k < stored.length; k++) stored[k]! += stored[k - components]!;
   const { lower, step } = entry;
   if (lower === undefined || step === undefined) return stored;
@@ -268,7 +268,7 @@ function embeddingOf(arrays: Arrays, { scales }: SplatData, maxStretch: number):
   return { meanTets, arms, maxStretch };
 }
 
-/** Return the bands above 0 with all colours of a coefficient side by side, and their scales. */
+/** Return the SH bands above 0 with all colours of a coefficient side by side, and their scales. */
 function bandsOf(text: BodyText, arrays: Arrays): { bands: Uint8Array; bandScales: Float32Array } {
   const coefficients = (text.degree + 1) ** 2 - 1;
   const bands = new Uint8Array(3 * coefficients * text.count);
@@ -285,7 +285,7 @@ function bandsOf(text: BodyText, arrays: Arrays): { bands: Uint8Array; bandScale
   return { bands, bandScales };
 }
 
-/** Return quaternions w, x, y, z of vectors that are axis times angle. */
+/** Return the quaternions w, x, y, z of rotation vectors (axis times angle). */
 function quaternions(vectors: Float32Array): Float32Array {
   const result = new Float32Array((4 * vectors.length) / 3);
   for (let i = 0; i < vectors.length / 3; i++) {

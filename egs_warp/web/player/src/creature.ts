@@ -7,7 +7,7 @@ import { splatRenderer } from "../../client/src/splat_renderer";
 import { loadBundle, type Bundle, type BundleCage, type Facts } from "./bundle";
 
 export class Creature {
-  /** Metres, with `up` upwards; move, rotate or scale it as any other object. */
+  /** Group in metres, with `up` upwards; it can be moved, rotated or scaled like any other object. */
   readonly object: THREE.Group;
   readonly bodies: Bodies;
 
@@ -63,9 +63,9 @@ export function surfaceOf(bundle: Bundle): Int32Array {
   return new Int32Array(triangles);
 }
 
-/** Load a bundle and add it to a three.js scene; resolves when its first frames have arrived.
+/** Load a bundle and add it to a three.js scene; resolves when the first frames of the bundle have arrived.
  *
- * A scene without a `SparkRenderer` receives one. One that is there must have been created with `covSplats: true`,
+ * If the scene has no `SparkRenderer`, one is added. An existing one must have been created with `covSplats: true`,
  * because the cage shears splats. */
 export async function addCreature(
   scene: THREE.Scene,

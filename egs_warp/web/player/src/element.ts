@@ -8,17 +8,17 @@ import { BundleStage } from "./stage";
 import { STYLE } from "./style";
 
 const SPEEDS = [0.25, 0.5, 1, 2];
-/** Time per image above which playback waits for the order of the splats, s. */
+/** Time per image above which playback waits until the splats are sorted, s. */
 const SLOW_FRAME_TIME = 1 / 15;
 /** Distance from the window at which a bundle is loaded. */
 const LOAD_MARGIN = "300px";
 
 /** Player of a bundle. Attributes: `src`, `poster`, `autoplay`, `loop`, `controls`, `speed`, `background`. Its methods,
- * properties and events are named as those of a video. */
+ * properties and events have the names of a video element's. */
 export class EgsPlayer extends HTMLElement {
   static readonly observedAttributes = ["src", "poster", "loop", "controls", "speed", "background"];
 
-  /** Holds the canvas of the stage. */
+  /** Element that contains the canvas of the stage. */
   private readonly frame = element("div", { class: "frame" });
   private readonly image = element("img", { alt: "", hidden: "" });
   private readonly message = element("p", { class: "message", role: "alert", hidden: "" });
@@ -33,7 +33,7 @@ export class EgsPlayer extends HTMLElement {
   private isDrawn = false;
   private isComplete = false;
   private isVisible = false;
-  /** Number of the load in progress; a later one replaces it. */
+  /** Number of the current load; a later load replaces it. */
   private loads = 0;
   private isLoading = false;
   private lastTime = 0;
@@ -41,7 +41,7 @@ export class EgsPlayer extends HTMLElement {
 
   constructor() {
     super();
-    // The player reads these when they are known.
+    // The player calls these functions when the values are known.
     const lastFrame = (): number => (this.bundle?.facts.frames ?? 1) - 1;
     const rate = (): number => this.bundle?.facts.rate ?? 1;
     this.player = new Player(
@@ -97,7 +97,7 @@ export class EgsPlayer extends HTMLElement {
     else this.stage?.setBackground(value ?? "");
   }
 
-  /** Seconds of the film that is shown. */
+  /** Current time in the film, s. */
   get currentTime(): number {
     return this.player.seconds;
   }
@@ -126,7 +126,8 @@ export class EgsPlayer extends HTMLElement {
     this.bar.update();
   }
 
-  /** As of a video: 0 for nothing, 1 when the duration is known, 3 when it can play, 4 when all of it has arrived. */
+  /** As for a video: 0 for no data, 1 when the duration is known, 3 when playback can start, 4 when all data have
+   * arrived. */
   get readyState(): number {
     if (this.stage === undefined) return 0;
     if (!this.isDrawn) return 1;
@@ -212,7 +213,7 @@ export class EgsPlayer extends HTMLElement {
     if (this.hasAttribute("autoplay") && !isStill) this.play();
     this.update();
     this.dispatchEvent(new Event("canplay"));
-    // In a headset the images are those of its session.
+    // In a headset, this is the animation loop of its session.
     stage.renderer.setAnimationLoop((now) => this.tick(now));
   }
 
@@ -232,7 +233,7 @@ export class EgsPlayer extends HTMLElement {
     this.image.hidden = !this.hasAttribute("poster");
   }
 
-  /** The wheel zooms only while the canvas has the focus; elsewhere it scrolls the page. */
+  /** Let the wheel zoom only while the canvas has the focus; otherwise the wheel scrolls the page. */
   private allowZoom(on: boolean): void {
     if (this.stage !== undefined) this.stage.controls.enableZoom = on;
   }
@@ -251,7 +252,7 @@ export class EgsPlayer extends HTMLElement {
     const { player } = this;
     this.stage?.show(player.framePosition);
     this.bar.element.hidden = !this.hasAttribute("controls") || this.stage === undefined;
-    // Without a bar, a player that does not start by itself shows one large button.
+    // Without a bar, a player without `autoplay` shows one large button.
     this.startButton.hidden = player.playing || this.hasAttribute("autoplay") || !this.bar.element.hidden;
     this.bar.update();
     if (this.stage !== undefined) this.dispatchEvent(new Event("timeupdate"));
@@ -262,7 +263,7 @@ export class EgsPlayer extends HTMLElement {
     if (stage === undefined) return;
     const { isPresenting } = stage.headset;
     if (!this.isVisible && !isPresenting) return;
-    // In an outdated order, the ground would hide the body.
+    // With an outdated order, the ground would hide the body.
     if (!isPresenting && player.playing && this.frameTime > SLOW_FRAME_TIME && stage.sorting) return;
     const elapsed = this.lastTime === 0 ? 0 : (now - this.lastTime) / 1000;
     this.lastTime = now;

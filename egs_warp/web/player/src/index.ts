@@ -1,4 +1,4 @@
-// Entry point of the package for pages: defines <egs-player>, with three.js and Spark included.
+// Entry point of the package for pages: defines <egs-player> and includes three.js and Spark.
 
 import { EgsPlayer } from "./element";
 

@@ -9,7 +9,7 @@ import type { Bundle, Camera } from "./bundle";
 import { Creature, surfaceOf } from "./creature";
 
 const UP = new THREE.Vector3(0, 0, 1);
-/** Camera of a bundle that has none: its direction, and its distance in body heights. */
+/** Camera for a bundle without one: its direction, and its distance in body heights. */
 const DIRECTION = new THREE.Vector3(-0.5, 1, -0.25).normalize();
 const DISTANCE = 4;
 
@@ -20,7 +20,7 @@ export class BundleStage extends Stage {
   private readonly isFlat: boolean;
   /** Height of the ground, m. */
   private readonly groundHeight: number;
-  /** The attribute `background`. */
+  /** Value of the attribute `background`. */
   private background = "";
 
   constructor(bundle: Bundle) {
@@ -52,12 +52,12 @@ export class BundleStage extends Stage {
 
   protected get hasOpaqueFloor(): boolean {
     if (this.mode === "immersive-ar") return this.isFlat;
-    // Where the page shows through, the floor hides as in the studio.
+    // Where the page is visible behind the creature, the floor hides splats as in the studio.
     const isStudio = this.mode !== undefined || this.background === "" || this.background === "transparent";
     return isStudio && this.hasFloor;
   }
 
-  /** True if the floor of the studio fits the bundle: flat ground with nothing of a scene on it. */
+  /** True if the studio's floor suits the bundle: flat ground, and no scene. */
   private get hasFloor(): boolean {
     return this.isFlat && !this.bodies.hasStill;
   }
@@ -68,13 +68,14 @@ export class BundleStage extends Stage {
     const colour = mode === undefined ? background : "";
     this.ground.mesh.visible = colour === "" && this.hasFloor && !isInRoom;
     this.ground.shadowMesh.visible = isInRoom && this.isFlat;
-    // A bundle of nothing but a scene is what the user wants to see.
+    // A bundle that contains only a scene shows the scene in a room, too.
     this.bodies.showStill(!isInRoom || !this.bodies.hasMoving);
     if (colour === "transparent") renderer.setClearColor(0x000000, 0);
     else renderer.setClearColor(colour === "" ? BACKGROUND : new THREE.Color().setStyle(colour), 1);
   }
 
-  /** Show the studio for an empty text, nothing behind the creature for "transparent", otherwise a colour of CSS. */
+  /** Set the background: an empty text shows the studio, "transparent" shows nothing, any other value is a CSS
+   * colour. */
   setBackground(colour: string): void {
     this.background = colour;
     this.showSurroundings();
@@ -120,7 +121,7 @@ export class BundleStage extends Stage {
     return this.box().getCenter(new THREE.Vector3());
   }
 
-  /** Place the camera as in the film, and turn it about the middle of the bodies. */
+  /** Place the camera as in the film, so that it orbits the middle of the bodies. */
   private placeCamera(film: Camera | undefined): void {
     const centre = this.centre();
     const forward = film === undefined ? DIRECTION.clone() : new THREE.Vector3(...film.forward);
