@@ -42,7 +42,9 @@ def distance_to_triangles(corners: np.ndarray, p: np.ndarray) -> np.ndarray:
 def brute_force(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Test all T tetrahedra for each of P points.
 
-    Returns: Barycentric weights (P, T, 4), their minima (P, T) and the distances (P, T).
+    Returns:
+        Barycentric weights (P, T, 4), their minima (P, T) and the distances (P, T).
+    """
     x = mesh.nodes[mesh.tets]
     system = np.concatenate([x.transpose(0, 2, 1), np.ones((len(x), 1, 4))], axis=1)
     right = np.concatenate([points, np.ones((len(points), 1))], axis=1)

@@ -30,8 +30,8 @@ def test_spz_by_hand(version: int, tmp_path: Path) -> None:
     if version < 3:
         rotation = bytes([128, round((-0.6 + 1) * 127.5), 128])
     else:
-        # Components x, y, z, w. The largest, w (index 3), is omitted; every other one has a sign bit and nine bits of #
-        |c| sqrt(2).
+        # Components x, y, z, w. The largest, w (index 3), is omitted; every other one has a sign bit and nine bits
+        # of |c| sqrt(2).
         rotation = struct.pack("<I", 3 << 30 | 0 << 20 | (512 | round(0.6 * 2**0.5 * 511)) << 10 | 0)
     body = struct.pack("<IIIBBBB", 0x5053474E, version, 1, 1, 12, version == 3, 0) + position
     body += bytes([51]) + bytes([255, 128, 0]) + bytes([160, 96, 0]) + rotation
