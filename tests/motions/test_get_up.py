@@ -127,7 +127,8 @@ def test_getting_up_fails_after_all_attempts() -> None:
 
 @cache
 def risen(degrees: float, sideways: bool) -> tuple[FallMonitor, list[StepReport], BodyState, BodyState]:
-    """Simulate a body that lies on its side during two motions of standing, the first of which lasts a second."""
+    """Simulate a body that starts on its side, with two stands, the first of which lasts a second. Return the monitor,
+    all reports, and the first and the last state."""
     made, start = block(), lying(degrees, FORWARD if sideways else LEFT)
     parts = [
         MotionTask("stand", {}, lambda place: StandFor(place, 1.0)),
