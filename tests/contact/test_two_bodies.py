@@ -1,5 +1,4 @@
-"""Contact between two bodies in a reference step, against closed forms of collision, rest and sliding.
-"""
+"""Contact between two bodies in a reference step, against closed forms of collision, rest and sliding."""
 
 from __future__ import annotations
 

@@ -419,7 +419,7 @@ def test_the_rotation_of_a_rank_one_map_maps_its_line(device: str) -> None:
 
 
 def test_axes_keep_their_order(device: str) -> None:
-    """Of all six orders of a frame's columns, the one best aligned with the reference is chosen."""
+    """The best aligned of all six orders of a frame's columns is chosen."""
     count = 200
     frames = turns_of(count, 4)
     carried = np.random.default_rng(10).normal(size=(count, 3, 3))
@@ -434,7 +434,7 @@ def test_axes_keep_their_order(device: str) -> None:
 
 
 def test_axes_keep_their_signs(device: str) -> None:
-    """Of the four choices of signs with det = +1, the one closest to the reference is chosen."""
+    """The signs closest to the reference are chosen from the four choices with det = +1."""
     count, random = 200, np.random.default_rng(9)
     frames = turns_of(count, 3)
     orders = np.array([random.permutation(3) for _ in range(count)])

@@ -1,5 +1,4 @@
-"""The soft body: mass, momenta, energy, best-fit rotation, and elasticity and damping from its height.
-"""
+"""The soft body: mass, momenta, energy, best-fit rotation, and elasticity and damping from its height."""
 
 from __future__ import annotations
 

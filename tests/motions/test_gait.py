@@ -15,8 +15,8 @@ GAIT = Gait.create(4, 4, 0.03, LEGGED_TIMING, time_unit=0.32)
 
 @given(st.integers(2, 9))
 def test_every_foot_swings_once_per_cycle_and_not_with_its_neighbour(count: int) -> None:
-    """Of four feet, those on a diagonal swing together. Neighbours never swing together, and at least one foot stands
-    at any time."""
+    """Neighbouring feet never swing together, and at least one foot stands at any time. With four feet, those on a
+    diagonal swing together."""
     groups = feet_in_turn(count)
     assert sorted(foot for group in groups for foot in group) == list(range(count))
     assert all(0 < len(group) < count for group in groups)

@@ -56,7 +56,7 @@ def test_a_nod_has_as_many_dips_as_requested(person: Stance) -> None:
 
 
 def test_a_wave_raises_the_tip_of_the_right_branch(person: Stance) -> None:
-    """Of two arms at equal height, the right one waves. A small rotation along the curve moves its tip up."""
+    """The right one of two arms at equal height waves. A small rotation along the curve moves its tip up."""
     gesture = wave(person, defaults("wave"))
     (part,), (channel,) = gesture.parts, gesture.channels
     local = person.ground.local(person.standing)

@@ -136,7 +136,7 @@ def risen(degrees: float, sideways: bool) -> tuple[FallMonitor, list[StepReport]
     ]
     watch = FallMonitor(MotionSequence(made.place, parts), made.place, gets_up=True)
     state, memory, reports = start, made.stepper.initial_memory(), []
-    # Enough steps for all attempts.
+    # The number of steps suffices for all attempts.
     for _ in range(1800):
         wishes = watch.objectives(state, reports[-1] if reports else None, DT)
         state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)

@@ -16,8 +16,7 @@ GRAVITY, STEP = 9.81, 1 / 60
 )
 @pytest.mark.parametrize("height", [1.0, 1.7])
 def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTarget, height: float) -> None:
-    """Thrust and flight are integrated by implicit Euler; the landing is a linear inverted pendulum.
-    """
+    """Thrust and flight are integrated by implicit Euler; the landing is a linear inverted pendulum."""
     com_height, ahead = 0.45 * height, 0.2 * height
     plan = plan_jump(
         target,

@@ -151,7 +151,7 @@ def test_a_film_from_straight_above_or_below(performance: SimulatedRun, side: fl
 
 
 def test_of_several_views_the_nearest_to_the_default_is_filmed(performance: SimulatedRun) -> None:
-    """Of seven views around the body, the one nearest to the default view is used."""
+    """The camera takes the one of seven view directions that is nearest to the default view."""
     first, second = thing().plane.tangents()
     around = 2.0 * np.pi * (np.arange(7)[:, None] + 0.3) / 7
     ways = np.cos(around) * first + np.sin(around) * second + 0.5 * thing().plane.normal

@@ -122,8 +122,8 @@ def test_failures_of_colmap_are_one_line(
 def test_photos_of_a_room_get_their_known_poses(
     data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of twelve adjacent photos of the bonsai, one is rotated by an EXIF tag. All get poses, and the relative distances
-    of the cameras are the known ones."""
+    """All twelve adjacent photos of the bonsai, one of which is rotated by an EXIF tag, get poses. The relative
+    distances of the cameras are the known ones."""
     pytest.importorskip("pycolmap")
     photos = tmp_path / "photos"
     photos.mkdir()

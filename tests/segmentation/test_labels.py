@@ -75,7 +75,7 @@ def test_rough_masks_of_three_views_segment_a_stool() -> None:
 
 
 def test_the_confidence_of_a_vote_grows_with_the_root_of_its_pixels() -> None:
-    """Of two similar neighbours, one is certainly outside, and the vote for the other to be inside costs less than
+    """One of two similar neighbours is certainly outside, and the vote for the other to be inside has less weight than
     their link, so both become outside. Nine times as many pixels have three times the weight.
     """
     pair = round_ones(np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]]), 0.02)

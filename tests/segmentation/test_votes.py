@@ -56,7 +56,7 @@ def test_votes_are_the_blending_weights(device: str) -> None:
 
 
 def test_a_hidden_gaussian_has_little_weight(device: str) -> None:
-    """Of two equal Gaussians, one behind the other, the front one is almost fully visible, the other one is not."""
+    """If two equal Gaussians are one behind the other, the front one is almost fully visible, the other one is not."""
     cloud = GaussianCloud.from_numpy(
         np.array([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.7, 0.0, 0.0]]),
         np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)),

@@ -14,7 +14,7 @@ from egs_warp.muscles.tension import MuscleEnergy
 
 @dataclass(frozen=True)
 class ReferenceIterate:
-    """Velocities (N, 3) m/s and contact forces (n, 3) N; the residual there, and the Newton step from there."""
+    """Newton iterate: velocities (N, 3), m/s, and contact forces (n, 3), N, with its residual and its Newton step."""
 
     linearization: ContactLinearization
     tension: MuscleEnergy | None
@@ -35,7 +35,7 @@ class ReferenceIterate:
 
     @property
     def residual_norm(self) -> float:
-        """Norm of the residual with contact forces, divided by dt x weight; not finite where an element is inverted."""
+        """Norm of the residual with contact forces, divided by dt x weight; not finite if an element is inverted."""
         return float(np.linalg.norm(self.residual)) / self.linearization.tangent.problem.residual_scale
 
     @property
