@@ -73,8 +73,8 @@ def test_an_edited_file_has_no_mutants_of_its_old_text(room: Path) -> None:
 
 @pytest.mark.slow
 def test_the_nearest_test_comes_first() -> None:
-    """Tests are sorted by the number of imports from the test to the module, including imports of kernels by host code.
-    The module's own test is first."""
+    """Tests are ordered by the number of imports from the test to the module, from host code to its kernels; the
+    module's own test is first."""
     nearest = ["tests/contact/test_selection.py", "tests/contact/test_contact_set.py"]
     assert mutants.tests_of("contact", "egs_warp/contact/selection.py")[:2] == nearest
     assert mutants.tests_of("fem", "egs_warp/kernels/fem/elasticity.py")[0] == "tests/fem/test_simd_elasticity.py"

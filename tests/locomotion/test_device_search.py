@@ -36,8 +36,8 @@ FRICTION = 0.6
 
 
 def body_program(seed: int, activations: int, contacts: int, *, bias: float = 0.0) -> CoulombProgram:
-    """Return the program of a random body with objectives on some of its velocities; ``bias`` is an additional downward
-    velocity."""
+    """Return the program of a random body with objectives on some of its velocities; ``bias`` is subtracted from the
+    normal velocities of all contacts."""
     rng = np.random.default_rng(seed)
     freedoms = activations + 2 * contacts + 6
     half = rng.standard_normal((freedoms, freedoms)) / np.sqrt(freedoms)

@@ -60,8 +60,8 @@ def coarse_creature(
     """Build a body of ``mesh`` that stands on its lowest nodes and faces ``forward`` (3,); ``up`` (3,) is opposite to
     gravity.
 
-    With a ``field`` in place of the floor, all nodes of its base are contact points; with ``all_round``, all nodes of
-    its surface.
+    Contact points are the nodes of its base. With a ``field`` in place of the floor, they are a grid on its base; with
+    ``all_round``, all nodes of its surface.
     """
     body = make_body(mesh, FLOOR, up=up, sag=sag, device="cpu")
     muscles = automatic_muscles(

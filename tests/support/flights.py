@@ -15,7 +15,7 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 def rigid_flight() -> Trajectory:
     """Return the flight of a block that takes off with (1, 0, 2) m/s and rotates about the vertical.
 
-    Positions and velocities satisfy implicit Euler.
+    The centre of mass satisfies implicit Euler; the velocities do not include the rotation.
     """
     mesh = block_mesh()
     mass = mesh.lumped_masses(1000.0)

@@ -37,8 +37,8 @@ def test_displayed_time_is_steady_and_never_decreases(chromium: Any, session: Se
         )
         shown, elapsed = np.array(shown).T
         assert np.diff(shown).min() >= 0.0 and shown[-1] > shown[0]
-        # If the solver is slower than the screen, a frame is shown in several images; if the screen is slower, an image
-        # advances by the elapsed time.
+        # If the solver is slower than the screen, a frame of the solver is shown in several images; if the screen is
+        # slow, an image advances by the time that has passed.
         assert (np.diff(shown) < 0.1 + np.diff(elapsed)).all()
         assert "stand" in page.text_content(".pace") or "jump" in page.text_content(".pace")
 

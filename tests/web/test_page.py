@@ -324,8 +324,8 @@ def test_play_advances_and_loops(chromium: Any, file: str):
 
 
 def test_a_slow_machine_waits_for_its_splats_to_be_sorted(chromium: Any, file: str):
-    """Playback stops until the splats are sorted; in an outdated order, the ground could be drawn over the moved
-    body."""
+    """Playback does not advance until the splats are sorted, because with an outdated order, the ground could be drawn
+    over the moved body."""
     page, _ = opened(chromium, file)
     page.evaluate("Object.defineProperty(egs.viewers[0], 'sorting', { get: () => window.held })")
     page.evaluate("() => { window.held = true; egs.player.playing = true; egs.frameTime = 0.001; }")
