@@ -22,7 +22,7 @@ _OBJECTS = (pawn, stool, figurine, snake)
 
 
 def _third_axes(cloud: GaussianCloud) -> np.ndarray:
-    """(n, 3) direction of each Gaussian's third axis."""
+    """Return the direction (n, 3) of the third axis of each Gaussian."""
     w, x, y, z = cloud.rotations.numpy().T
     return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
 

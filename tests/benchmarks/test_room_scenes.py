@@ -37,7 +37,7 @@ def test_samples_are_even_on_the_surface(scenes: ModuleType) -> None:
 
 
 def test_there_are_twenty_rooms(scenes: ModuleType) -> None:
-    """At least 20, with all toys, on every kind of support and beside every kind of neighbour."""
+    """At least 20 rooms have layouts with all toys, all kinds of support and all kinds of neighbours."""
     layouts = scenes.SCENES.values()
     assert len(layouts) >= 20 and {layout.toy for layout in layouts} == set(scenes.solids.TOYS)
     assert {"duvet", "floor", "carpet", "grass", "table", "chair", "sofa", "shelf"} == {
