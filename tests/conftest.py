@@ -1,4 +1,4 @@
-"""Fixtures: devices, a browser, and the folder of real captures."""
+"""Fixtures of all tests: devices, a browser, coarse bodies, a finished run, and the folder of real captures."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def data_dir() -> Path:
 
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
-    """One browser for all tests: Playwright can run only once in a process."""
+    """Start one browser for all tests, because Playwright can be started only once in a process."""
     from tests.support.chromium import started
 
     with started() as browser:
@@ -74,7 +74,7 @@ def device(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def coarse() -> Iterator[None]:
-    """Make ``animate`` build bodies of some 200 nodes, which are stepped twice as fast as 500."""
+    """Make ``animate`` build bodies of about 200 nodes, whose steps take half the time of the default 500 nodes."""
     from tests.support.coarse import coarse_cages
 
     with coarse_cages(120):

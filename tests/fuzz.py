@@ -26,19 +26,19 @@ from tests.support.memory import peak_bytes
 
 CORPUS = Path(__file__).parent / "corpus"
 _MEMORY = 256
-"""Maximum growth of the memory of a process, MiB; its inputs have a few kilobytes."""
+"""Maximum growth of the memory of a process that reads inputs of a few kilobytes, MiB."""
 _MAX_BUFFER = 4096
-"""Number of bytes from which Hypothesis draws one input."""
+"""Maximum number of random bytes from which Hypothesis generates one input."""
 _COUNTS: tuple[str, ...] = ("inputs", "valid", "refused", "broken")
 _PIECE = 20_000
-"""Number of inputs per process if a number of inputs is given."""
+"""Maximum number of inputs per process if ``--inputs`` is given."""
 _MAX_REASONS = 50
 """Maximum number of failures that are recorded for one reader."""
 _SEED = 20_261_122
 
 
 def main() -> int:
-    """Give each reader its share of the time; returns 1 if any reader failed."""
+    """Run each reader for its share of the time; return 1 if any reader failed, else 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0, help="total time of all readers (default %(default)s)")
     parser.add_argument("--inputs", type=int, default=0, help="maximum number of inputs per reader (0: no limit)")
@@ -66,7 +66,7 @@ def main() -> int:
 
 
 class Tally:
-    """Counts of each reader, stored in a file if a path is given."""
+    """Counts of inputs and outcomes of each reader, stored in a file if a path is given."""
 
     def __init__(self, names: list[str], path: Path | None) -> None:
         self._path, self._lock = path, threading.Lock()
@@ -95,7 +95,7 @@ class Tally:
                 self._path.write_text(json.dumps(self.counts, indent=1) + "\n")
 
     def report(self) -> int:
-        """Print a table; returns 1 if any reader failed."""
+        """Print a table of the counts; return 1 if any reader failed, else 0."""
         print("| reader | inputs | valid | refused | broken | peak MiB | driven by |\n|---|---|---|---|---|---|---|")
         for name, found in self.counts.items():
             print(f"| {name} |", " | ".join(str(found[key]) for key in (*_COUNTS, "mib", "by")), "|")
@@ -123,7 +123,7 @@ def _piece(name: str, tally: Tally, deadline: float, share: float, inputs: int) 
 
 
 def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
-    """Drive one reader and print the counts as a line of JSON."""
+    """Run one reader on random inputs, print the counts as a line of JSON and end the process."""
     atheris: Any = None
     if find_spec("atheris") is not None:
         import atheris
@@ -187,7 +187,7 @@ def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
 
 
 def _keep(name: str, data: bytes) -> str:
-    """Write a case where the tests find it; returns its name."""
+    """Write a failing input into the corpus, where the tests find it; return its name."""
     folder = CORPUS / name.replace(" ", "_")
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / hashlib.sha256(data).hexdigest()[:12]

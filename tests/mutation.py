@@ -1,4 +1,4 @@
-"""``make mutation``; ``python -m tests.mutation --help``. The implementation is in ``tests/support/mutation.py``."""
+"""Mutation tests: ``make mutation``, or ``python -m tests.mutation --help``; see ``tests/support/mutation.py``."""
 
 from __future__ import annotations
 

@@ -214,7 +214,8 @@ def test_a_plot_needs_an_existing_folder(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_no_flag_takes_an_empty_path() -> None:
-    """An empty path, for example from an unset variable, would mean the working folder."""
+    """All flags for paths refuse an empty value, for example from an unset variable, which would be the working
+    folder."""
     taken = [action.type for command in _parsers()[1].values() for action in command._actions]
     assert named_path in taken and Path not in taken
 
@@ -313,7 +314,7 @@ def _examples() -> list[str]:
 def test_the_examples_of_the_help_are_accepted(
     example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In an empty folder, each is rejected only because its files are missing."""
+    """In an empty folder, each example is rejected only because its files are missing."""
     monkeypatch.chdir(tmp_path)
     words = shlex.split(example)
     if words[0] in ("doctor", "demo", "samples"):
@@ -390,7 +391,7 @@ def test_axes_and_planes_are_read() -> None:
 
 @pytest.mark.parametrize(("given", "taken"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "4"}, "4")])
 def test_blas_uses_one_thread_by_default(given: dict[str, str], taken: str) -> None:
-    """The variable is set before NumPy, which reads it, is loaded."""
+    """The environment variable is set before NumPy is loaded, which reads it; a value of the user is kept."""
     script = """
 import atexit, os, sys
 import egs_warp.cli

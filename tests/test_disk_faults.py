@@ -66,7 +66,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A ball on a floor, its parts, and photos with poses."""
+    """Return a folder with a ball on a floor, its parts, and photos with poses."""
     folder = tmp_path_factory.mktemp("scene")
     write_scene(folder, views=4, size=64)
     posed_folder(folder / "posed")
@@ -76,14 +76,14 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def photos(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Folder of photos, whose poses a stand-in for pycolmap returns."""
+    """Return a folder of photos whose poses are estimated by a substitute for pycolmap."""
     reconstruct_by(monkeypatch, model)
     return photos_of_noise(tmp_path_factory.mktemp("photos") / "photos")
 
 
 @pytest.fixture
 def command(capture: Path, run_folder: Path, request: pytest.FixtureRequest) -> Command:
-    """Function that runs a line of ``COMMANDS``, with output to a folder, and returns its exit status."""
+    """Return a function that runs a line of ``COMMANDS`` with output to a folder, and returns its exit status."""
 
     def run(line: str, out: Path) -> int:
         places = {"capture": capture, "run": run_folder, "out": out}
@@ -123,7 +123,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     capsys: pytest.CaptureFixture[str],
     request: pytest.FixtureRequest,
 ) -> None:
-    """The write fails at its first byte or later: the status is 1, and existing files are complete."""
+    """If a write fails at its first byte or later, the exit status is 1, and only complete files are left."""
     for made in {"scene", "photos"} & set(re.findall(r"{(\w+)}", line)):
         request.getfixturevalue(made)
     with largest_file(size):
@@ -160,8 +160,8 @@ def test_each_file_operation_fails_once(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Each opening and renaming fails in turn and leaves a one-line error and no temporary file. A last run without a
-    fault writes everything. (``tests/pipelines/test_animate.py`` tests ``animate``.)
+    """Each opening and renaming of a file fails in turn, with a one-line error and no temporary file left. A last run
+    without a fault writes all files. (``tests/pipelines/test_animate.py`` tests ``animate``.)
     """
     out = tmp_path / "out"
     for number in range(200):
@@ -182,8 +182,8 @@ def test_each_file_operation_fails_once(
 def test_a_clock_that_jumps_changes_nothing(
     command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The clock jumps forward or back by a day at each reading, and a killed process has left a file with a date in the
-    future. The run finishes and removes that file but none of its own.
+    """The clock jumps forward or back by a day at each read, and a killed process has left a file with a date in the
+    future. The run finishes, and removes that file but none of its own files.
     """
     left = tmp_path / ".egs-0123456789abcdef.ply"
     left.write_text("half")

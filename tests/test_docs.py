@@ -1,4 +1,4 @@
-"""Cited pages exist, and every picture of the docs is listed with the command that makes it."""
+"""Documentation: cited pages exist, every image is listed with its command, and named code exists."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_the_gallery_opens_the_pages_that_the_script_makes_and_has_no_dead_link(
     hook = runpy.run_path(str(DOCS / "page_links.py"))["on_page_markdown"]
 
     class Files:
-        """Files of a site that contains one of the pages."""
+        """Substitute for the files of a site that contains one of the pages."""
 
         def get_file_from_path(self, path: str) -> str | None:
             return path if path == "assets/pages/jump.html" else None

@@ -1,8 +1,8 @@
-"""``docs/equations.md`` is complete and true: names exist, no equation of a docstring is missing, and cited tests test
-their equation.
+"""``docs/equations.md`` is complete and correct: all names exist, no equation of a docstring is missing, and cited
+tests test their equation.
 
-A test must not only mention its equation: it must call the code of that row, and for each equation one of the row's
-tests is shown to fail when the code of the row is wrong (``tests/test_formula_mutations.py``).
+A cited test must mention its equation and call the code of its row. For each equation, ``tests/support/mutations.py``
+has a wrong formula with which one of the row's tests fails (``tests/test_formula_mutations.py``).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MENTION = re.compile(rf"Eq\.\s*(\(\d+\)(?:{JOIN}\(\d+\))*|\(?\d+(?:{JOIN}\d+)*)"
 
 
 def table(text: str) -> dict[int, str]:
-    """Return the row of each equation."""
+    """Return the row of each equation by its number."""
     rows = [line for line in text.splitlines() if re.match(r"\| \d+ \|", line)]
     numbers = [int(line.split("|")[1]) for line in rows]
     assert len(set(numbers)) == len(numbers), "an equation has two rows"
@@ -59,9 +59,9 @@ class Reached:
     """Definitions that a test uses, directly or indirectly."""
 
     definitions: set[tuple[Path, str]] = field(default_factory=set)
-    """(file, function, class or variable)."""
+    """File and name of each function, class or variable."""
     words: set[str] = field(default_factory=set)
-    """Every name and attribute in them."""
+    """All names and attributes that occur in these definitions."""
 
 
 @cache

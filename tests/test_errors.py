@@ -1,4 +1,4 @@
-"""Errors name arguments; commands name flags."""
+"""Error messages: the library names arguments, the commands name flags."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""However a program is stopped, it prints one line, has a defined exit status and leaves no half-written file."""
+"""Programs that are stopped in any way print one line, have a defined exit status and leave no half-written file."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_a_closed_pipe_only_silences() -> None:
 def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
     """Return status, output and errors of a shell command in which ``egs-warp`` stands for the program."""
     line = command.replace("egs-warp", f"{sys.executable} -m egs_warp.cli")
-    # Unbuffered output, the default on some machines, would report each error when it is written.
+    # With unbuffered output, the default on some machines, each error would already be reported at the write.
     environment = os.environ | {"PYTHONIOENCODING": encoding, "PYTHONUNBUFFERED": ""}
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env=environment, timeout=120)
     return done.returncode, done.stdout, done.stderr
@@ -150,20 +150,20 @@ def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
     ],
 )
 def test_closed_outputs_do_not_change_the_status(command: str, status: int) -> None:
-    """Only a command whose result is its output fails because of a closed or full output, with status 1."""
+    """A closed or full output changes the exit status, to 1, only for commands whose result is their output."""
     ended, _, said = told_by(command)
     assert ended == status and "Traceback" not in said and said.count("\n") <= 1
 
 
 def test_files_do_not_get_the_numbers_of_closed_streams() -> None:
-    """A file with the number of a closed stream would receive what libraries print."""
+    """If a file got the descriptor of a closed standard stream, output of libraries would be written into it."""
     code = "from egs_warp.commands.exit_handling import one_line_errors\nwith one_line_errors('prog'):\n"
     code += " import os, tempfile\n with tempfile.TemporaryFile() as file: os._exit(file.fileno())"
     assert told_by(f'{sys.executable} -c "$(cat <<"END"\n{code}\nEND\n)" <&- >&- 2>&-')[0] > 2
 
 
 def test_characters_outside_the_terminal_encoding(tmp_path: Path) -> None:
-    """A folder's name with such a character is printed, escaped, after all files are written."""
+    """A folder whose name has such a character is printed with an escape sequence, after all files are written."""
     status, said, error = told_by(f"egs-warp samples '{tmp_path}/é'", encoding="ascii")
     assert status == 0 and "\\xe9" in said and error == ""
 

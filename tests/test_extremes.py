@@ -1,5 +1,5 @@
-"""A Gaussian with arbitrary values is either rejected, with the name of the attribute, or does no harm: images,
-gradients, motion, splits and training stay finite, and all other Gaussians keep every bit.
+"""A Gaussian with extreme values is either rejected, with the name of the attribute, or has no harmful effect: images,
+gradients, motion, splits and training stay finite, and all other Gaussians are bitwise unchanged.
 """
 
 from __future__ import annotations
@@ -39,14 +39,15 @@ log_scales = st.sampled_from([-0.99 * MAX_VALUE, -1e3, -104.0, -88.0, -45.0, -20
 
 @st.composite
 def changes(draw: st.DrawFn) -> dict[str, tuple[int, float]]:
-    """Draw changes of one or two attributes of the odd Gaussian: the number of values and the new value."""
+    """Draw changes of one or two attributes of the extreme Gaussian: for each, the number of changed components and
+    their value."""
     names = draw(st.sets(st.sampled_from(NAMES), min_size=1, max_size=2))
     chosen = {name: log_scales if name == "log_scales" else numbers for name in NAMES}
     return {name: (draw(st.integers(1, 4)), draw(chosen[name])) for name in sorted(names)}
 
 
 def odd(changed: dict[str, tuple[int, float]]) -> dict[str, np.ndarray]:
-    """An ordinary cloud with one odd Gaussian."""
+    """Return an ordinary cloud in which the values ``changed`` are set for one Gaussian."""
     values = ordinary()
     for name, (count, value) in changed.items():
         values[name].reshape(COUNT, -1)[ODD, :count] = value
@@ -77,7 +78,7 @@ def assert_finite(values: dict[str, Any]) -> None:
 
 
 def tried(law: Any) -> Any:
-    """Run the law on 40 cases in ``make test``."""
+    """Decorator that tests the property ``law`` on 40 cases in ``make test``."""
     profile = settings(max_examples=examples(40), phases=[Phase.generate])
     return profile(given(changed=changes())(law))
 
@@ -105,7 +106,7 @@ def test_gradients_are_finite(changed: dict[str, tuple[int, float]]) -> None:
 
 @tried
 def test_a_cage_deforms_it_and_leaves_all_others_unchanged(changed: dict[str, tuple[int, float]]) -> None:
-    """Eq. (14) to (17), for moved, bent, inverted and flattened cages, with splits where they bend."""
+    """Eq. (14) to (17): this holds for moved, bent, inverted and flattened cages, with splits where Gaussians bend."""
     cloud, usual = cloud_of(odd(changed)), cloud_of(ordinary())
     others = np.arange(COUNT) != ODD
     carriers = [Deformer(one, embed_gaussians(one, CAGE)) for one in (cloud, usual)]
@@ -148,7 +149,7 @@ def test_numbers_that_single_precision_cannot_square_are_refused(name: str, valu
 
 @pytest.mark.parametrize("size", [1e-320, 1e-200, 1e-40, 1e-10, 1.0, 1e10, 1e200, 1e300])
 def test_only_the_direction_of_a_quaternion_counts(size: float) -> None:
-    """A quaternion of length 0 is the identity."""
+    """Quaternions of any length are normalised; a quaternion of length 0 becomes the identity."""
     along = np.array([[0.6, -0.0, 0.0, 0.8], [-0.5, 0.5, 0.5, 0.5], [0.0, 0.0, 0.0, 0.0]])
     expected = np.array([along[0], along[1], [1.0, 0.0, 0.0, 0.0]])
     np.testing.assert_allclose(unit_quaternions(size * along), expected, atol=1e-3 if size < 1e-300 else 1e-7)

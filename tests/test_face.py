@@ -27,7 +27,7 @@ PACKAGE_CLASSES = {
 
 
 def readme_lines() -> str:
-    """The Python code of the README."""
+    """Return the Python code of the README."""
     (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     return block
 
@@ -49,8 +49,8 @@ def classes_of(annotation: object) -> list[set[str]]:
 
 
 def test_arguments_of_public_functions_are_public() -> None:
-    """Each parameter has an alternative that consists of public classes, or of records that a public function returns;
-    so has each parameter of the constructors of classes that no function returns."""
+    """Each parameter of a public function accepts a type that consists of public classes or of records that a public
+    function returns. So does each parameter of the constructor of a class that no function returns."""
     public: dict[str, Any] = {name: getattr(egs, name) for name in egs.__all__}
     functions: dict[str, Any] = {name: given for name, given in public.items() if inspect.isfunction(given)}
     returned = [inspect.signature(one).return_annotation for one in functions.values()]
@@ -98,8 +98,8 @@ def test_the_readme_shows_the_paper_in_fifteen_lines() -> None:
 
 @pytest.mark.slow
 def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The scene is the pawn with the floor near it, and there are fewer frames; otherwise the lines are unchanged. A
-    video is written, and the pawn crouches."""
+    """The lines run with a scene of the pawn and the floor near it, and with fewer frames. A video is written, and the
+    pawn crouches."""
     room = egs.scene("pawn", device="cpu").whole()[0]
     near = np.linalg.norm(room.means.numpy()[:, :2], axis=1) < 1.2
     egs.write_ply(tmp_path / "scene.ply", room.subset(near))

@@ -64,7 +64,7 @@ def test_slow_means_slow_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_failing_example_is_printed_as_a_decorator() -> None:
-    """Arguments on several lines and comments are joined; examples of ``st.data()`` have no decorator."""
+    """Arguments on several lines are joined into one, without comments; examples of ``st.data()`` have no decorator."""
 
     @settings(max_examples=50)
     @given(shape=st.builds(dict, x=st.integers(10**4, 10**5)), note=st.text())

@@ -1,4 +1,4 @@
-"""Partition of rows among threads, and repeated launches with other arguments."""
+"""Launches and memory: partition of rows among threads, repeated launches, pooled arrays, caches and mirrors."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_every_row_runs_once(device: str, threads: int, heavy: bool, count: int)
 
 
 def test_a_cached_launch_takes_its_new_arguments(device: str) -> None:
-    """Sizes, arrays, empty arrays, numbers and vectors all change between launches, in two threads at once."""
+    """Sizes, arrays, empty arrays, numbers and vectors change between launches, in two threads at the same time."""
     target = wp.get_device(device)
 
     def run(seed: int) -> None:
@@ -141,7 +141,7 @@ def test_capacities_are_few_and_not_much_larger() -> None:
 
 @pytest.mark.parametrize(("told", "most"), [("1", 1), ("0", 1), ("100000", None), ("", None), ("two", None)])
 def test_the_environment_may_limit_the_threads(told: str, most: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The number of threads is at most the available one, and at least one."""
+    """The number of threads is at least one, and at most the number that is available."""
     monkeypatch.delenv(THREADS, raising=False)
     there = available_threads()
     monkeypatch.setenv(THREADS, told)
@@ -175,7 +175,7 @@ def test_concurrent_tasks_on_one_thread_run_in_sequence(told: str, monkeypatch: 
 
 
 def test_an_error_waits_for_the_concurrent_task(monkeypatch: pytest.MonkeyPatch) -> None:
-    """When the error is raised, the data of both tasks can be reused."""
+    """The error is raised after the concurrent task has ended, so that the data of both tasks can be reused."""
     monkeypatch.setenv(THREADS, "2")
     begun, ended = threading.Event(), threading.Event()
 
@@ -194,7 +194,7 @@ def test_an_error_waits_for_the_concurrent_task(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_each_thread_has_its_own_cache() -> None:
-    """The cache keeps the most recent results by their arguments; another thread has its own."""
+    """Each thread has its own cache, which keeps the most recent results by their arguments."""
     make = thread_local_cache(2)(lambda *given: [*given])
     first = make(1, 2)
     assert first == [1, 2] and make(1, 2) is first and make(2, 1) is not first
@@ -207,7 +207,8 @@ def test_each_thread_has_its_own_cache() -> None:
 
 
 def test_mirrors_transfer_the_current_values(device: str) -> None:
-    """Cases: unchanged values, NaN, and device values that have changed since the last read-back."""
+    """The transferred values are correct if they are unchanged, NaN, or changed on the device since the last
+    read-back."""
     arrays = [wp.zeros(3, dtype=wp.float64, device=device) for _ in range(2)]
     one, other = mirrors = [PinnedMirror(array) for array in arrays]
     for values in ([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, np.nan, 3.0], [0.0, np.nan, 3.0], [0.0, 0.0, 0.0]):

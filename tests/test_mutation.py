@@ -1,4 +1,4 @@
-"""``make mutation``: its changes, the continuation of an interrupted run, and the list of survivors."""
+"""``make mutation``: its mutants, the continuation of an interrupted run, and the list of survivors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def larger(pair: Pair | None, *, floor: float = 0.5) -> float | None:
 
 @pytest.fixture
 def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A contact package that consists of one small file."""
+    """Create a tree whose package ``contact`` consists of one small file; return the file."""
     file = tmp_path / "egs_warp" / "contact" / "pair.py"
     file.parent.mkdir(parents=True)
     file.write_text(SOURCE)
@@ -39,7 +39,7 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_changes_are_other_programs_within_a_family(room: Path) -> None:
-    """There are no changes in annotations and guards and none that cannot run; ``+`` never becomes a shift."""
+    """Mutants are valid programs without changes in annotations and guards; ``+`` is never replaced by a shift."""
     found = mutants.sample("contact", 100, 1)
     assert len({(mutant.line, mutant.before, mutant.after) for mutant in found}) == len(found) >= 8
     for mutant in found:
@@ -117,6 +117,6 @@ def _differs(copy: mutation.Copy, path: Path) -> bool:
 
 @pytest.mark.parametrize("survivor", SURVIVORS, ids=lambda survivor: survivor.before)
 def test_survivors_refer_to_existing_lines(survivor: Survivor) -> None:
-    """When a line is rewritten, its survivors must be removed."""
+    """When a line is rewritten, its survivors must be removed from the list."""
     lines = [line.strip() for line in (mutants.ROOT / "egs_warp" / survivor.file).read_text().splitlines()]
     assert survivor.before in lines and len(survivor.reason) > 20

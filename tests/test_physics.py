@@ -1,4 +1,5 @@
-"""Laws for any body, pose and motion: Hypothesis generates a few cases in the quick form, hundreds in the long one."""
+"""Physical laws for any body, pose and motion; Hypothesis generates a few cases in the quick form, hundreds in the long
+one."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ def drawn(count: int, **given_: st.SearchStrategy[Any]) -> Callable[[Callable[..
 
 
 def some_tension(shape: Shape, share: float) -> MuscleEnergy:
-    """Return random tensions, and compressions of at most a third, of muscles that fit the body."""
+    """Return automatic muscles of the body with random tensions up to ``share`` of their bounds, and compressive ones
+    up to a third of that."""
     body = shape.body()
     muscles = automatic_muscles(body.mesh, FLOOR.normal, body_weight=body.weight, height=body.height)
     pulls = np.random.default_rng(shape.seed).uniform(-share / 3.0, share, muscles.segment_count)
@@ -75,15 +77,16 @@ def test_both_momenta_of_free_flight(count: int) -> None:
 
 def spin_work(problem: StepProblem, result: CoupledResult) -> float:
     """Return the work, J, of the momentum correction w x r in a step without muscles: w times the angular momentum of
-    the end velocities with the lever arms of the start."""
+    the end velocities about the lever arms at the start."""
     given = problem.momentum_correction(problem.internal_gradient(result.velocities, None))
     momenta = problem.node_mass[:, None] * np.cross(problem.lever_arms, result.velocities)
     return float(given @ momenta.sum(axis=0))
 
 
 def test_restored_spin_adds_energy_only_at_the_start() -> None:
-    """A soft block that spins as fast as in these tests, but is not stretched yet, stretches in its first step. There,
-    restoring the spin may add energy, but less than the work of the correction; from then on, the energy decreases."""
+    """An unstretched soft block that spins as fast as in these tests is stretched in its first step. In this step,
+    restoring the spin adds energy, but less than a fifth of the work of the correction; afterwards, the energy
+    decreases."""
     shape = Shape((3, 2, 4), (0.294, 0.392, 0.333), 1.16, sag=0.05, poisson_ratio=0.137, damping_ratio=0.05, seed=3657)
     throw = Throw((2.72, 0.0, 0.5), (0.0, 0.0186, 0.0), (0.0, 0.0, 0.0), (1.5, 0.0, -1.42), noise=0.0, seed=0)
     body = shape.body()
@@ -186,8 +189,8 @@ def test_more_friction_never_slides_farther(count: int) -> None:
 
 
 def stopping_way(speed: float, friction: float) -> float:
-    """Return the sliding distance in body heights of a point with initial ``speed`` sqrt(g H), in 30 steps of implicit
-    Euler, which uses the lower speed of each step: v^2 / (2 mu g), minus half a step's displacement."""
+    """Return the sliding distance, in body heights, of a point with the initial speed ``speed`` sqrt(g H), in 30 steps
+    of implicit Euler. It is less than v^2 / (2 mu g), because each step uses its lower end speed."""
     step = 0.1
     return sum(step * max(speed - k * step * friction, 0.0) for k in range(1, 31))
 
@@ -207,8 +210,8 @@ def slipped(body: SoftBody, push: np.ndarray, friction: float) -> float:
 
 @at_length
 def test_steps_converge_at_order_one(count: int) -> None:
-    """Eq. (4), Eq. (6): the motion of a free body over a fraction of its longest oscillation, in n, 2 n and 4 n steps:
-    the second difference is half of the first.
+    """Eq. (4), Eq. (6): if the motion of a free body over a fraction of its longest period is computed in n, 2 n and 4
+    n steps, the second difference of the results is about half of the first.
     """
 
     @drawn(count // 2 if count > QUICK else 3, shape=shapes(), throw=throws())
@@ -239,7 +242,8 @@ def test_steps_converge_at_order_one(count: int) -> None:
     ],
 )
 def test_no_element_is_inverted_in_2000_frames_of_random_activations(mesh: TetMesh, strength: float) -> None:
-    """In every frame all muscles get random lengths within their bounds, or within ten times their bounds."""
+    """In every frame, all muscles get random activations within the bounds for ``strength``, the default one or ten
+    times as much."""
     made = coarse_creature(mesh, forward=np.array([1.0, 0.0, 0.0]), strength=strength)
     stepper, state, memory = made.stepper, made.start, made.stepper.initial_memory()
     random, bounds, least = np.random.default_rng(7), made.stepper.muscles.bounds, np.inf

@@ -1,4 +1,4 @@
-"""Bill of materials of a release: every package with its hash, the dependencies, and the contents of the page."""
+"""Release files: the bill of materials with every package, hash and dependency, and consistent version numbers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def wheel(tmp_path: Path) -> Path:
 
 
 def reports() -> list[dict[str, Any]]:
-    """Reports in pip's format: for this platform, and for one on which a package has another file."""
+    """Return reports in pip's format: for this platform, and for one on which a package has another file."""
     own = {"metadata": {"name": "egs_warp", "version": "0.1.0", "requires_dist": ["NumPy>=1.26", "scipy>=1.12"]}}
     scipy = entry("scipy", "1.17.1", "b" * 64, ["numpy<3", 'pytest; extra == "test"'], license="BSD\n" * 40)
     here = [own, scipy, entry("numpy", "2.4.6", "a" * 64, [], license_expression="BSD-3-Clause")]

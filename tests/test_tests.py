@@ -1,4 +1,4 @@
-"""Structure of the tests: they mirror the packages, and share code only through ``tests/support``."""
+"""Structure of the tests: test files mirror the modules of the package, and share code only by ``tests/support``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ACROSS = {
 
 
 def imports(path: Path) -> set[str]:
-    """Return every module that a file imports, and every name from it."""
+    """Return the modules that a file imports, and the qualified names that it imports from them."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):

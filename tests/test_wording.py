@@ -1,4 +1,4 @@
-"""The check of names and prose reports what the word list rules out, and nothing else."""
+"""The check of names and prose reports the words that the word list rules out, and no others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Worker threads execute each task once, and Ctrl-C at any moment ends the process."""
+"""Worker threads: each task is executed once, and Ctrl-C at any time ends the process."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_a_forked_process_has_helpers_of_its_own() -> None:
 
 @pytest.mark.slow
 def test_ctrl_c_at_any_moment_ends_the_process() -> None:
-    """Each of 200 processes ends after Ctrl-C at a random moment; with ``ThreadPoolExecutor``, some never would."""
+    """Each of 200 processes ends after Ctrl-C at a random time; with ``ThreadPoolExecutor``, some of them would not."""
     moments = random.Random(7)
     for _ in range(200):
         run = subprocess.Popen([sys.executable, "-c", BUSY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -22,7 +22,7 @@ _OBJECTS = (pawn, stool, figurine, snake)
 
 
 def _third_axes(cloud: GaussianCloud) -> np.ndarray:
-    """(n, 3) direction of each Gaussian's third axis."""
+    """Return the direction (n, 3) of the third axis of each Gaussian."""
     w, x, y, z = cloud.rotations.numpy().T
     return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
 
@@ -34,8 +34,8 @@ def _thing(make: Callable[..., BuiltInObject], device: str) -> BuiltInObject:
 
 @pytest.mark.parametrize("make", _OBJECTS)
 def test_object_stands_on_its_plane(make: Callable[..., BuiltInObject], device: str) -> None:
-    """The object is one unit tall (the snake two units long), has SH with a view-dependent part and flat splats, and
-    its base straddles the plane slightly."""
+    """The object is one unit tall (the snake 2.1 units long) and has flat splats with view-dependent SH. Its base
+    straddles the plane slightly."""
     thing = _thing(make, device)
     cloud = thing.cloud
     heights, opacities = thing.plane.heights(cloud.means.numpy()), cloud.opacities()
@@ -48,7 +48,7 @@ def test_object_stands_on_its_plane(make: Callable[..., BuiltInObject], device: 
     assert np.abs(cloud.sh.numpy()[:, 1:]).max() > 0.05
     scales = np.exp(np.sort(cloud.log_scales.numpy(), axis=1))
     assert np.median(scales[:, 0] / scales[:, 1]) < 0.35
-    # Gaussians reach through the plane by three standard deviations, as in a capture.
+    # As in a capture, some Gaussians above the plane reach through it within three standard deviations.
     reach = (
         3.0
         * np.exp(cloud.log_scales.numpy()[:, :2]).max(axis=1)

@@ -1,4 +1,4 @@
-"""Built-in scenes: whole floors, and an object that the camera sees."""
+"""Built-in scenes: the floor has no holes, and the camera sees the object."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ LONG = {"figurine", "snake"}
     "name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in BUILT_IN_SCENES]
 )
 def test_scene(name: str) -> None:
-    """The floor is complete, also under the object; the camera sees the object; the parts add up."""
+    """The floor is complete, also under the object; the camera sees the object; object and background make up the
+    scene."""
     made = scene(name)
     whole, is_object = made.whole()
     assert whole.count == made.object.count + made.background.count == len(is_object)

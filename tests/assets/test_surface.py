@@ -10,7 +10,8 @@ from egs_warp.geometry.gaussians import GaussianCloud
 
 
 def test_baked_light_against_closed_forms(device: str) -> None:
-    """A disc of radius r overhead at height h hides the share r^2 / (r^2 + h^2) of a level point's sky."""
+    """A horizontal disc of radius r at height h above a horizontal surface hides the fraction r^2 / (r^2 + h^2) of its
+    sky."""
     angle = np.linspace(0.0, 2.0 * np.pi, 129)[:-1]
     radius, height = 0.5, 0.8
     rim = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(128, height)])
@@ -42,7 +43,7 @@ def test_sh_of_a_highlight() -> None:
         camera = Camera.look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]), width=65, height=65)
         return float(render_gaussians(cloud, camera).colour.numpy().reshape(65, 65, 3)[32, 32].mean())
 
-    # The renderer caps alpha at 0.99 over white.
+    # The renderer limits alpha to 0.99; the background is white.
     assert seen_from(10.0 * direction[0]) == pytest.approx(0.99 * 0.6 + 0.01, abs=0.01)
     assert seen_from(-10.0 * direction[0]) == pytest.approx(0.99 * 0.4 + 0.01, abs=0.02)
 

@@ -1,4 +1,4 @@
-"""Figures of the effort benchmark: the load of a record, the number of steps before lift-off, and reversals."""
+"""Measures of the effort benchmark: load per step, number of steps before lift-off, and reversals of the load."""
 
 from __future__ import annotations
 

@@ -18,10 +18,10 @@ def figure7(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_scores_of_a_known_image(figure7: ModuleType) -> None:
-    """Measure a known image.
+    """Compute the scores of a known image.
 
-    Upper half 0.5 with target 0.6: 20 dB; 0.1 in the lower half: a residual of a fifth of the upper half, and the
-    mean square over the whole image is the same 0.01.
+    The upper half has the value 0.5 and the target 0.6, so its PSNR is 20 dB. The lower half has the value 0.1 and the
+    target 0: the residual is a fifth of the upper half, and the mean square error of the whole image is 0.01, too.
     """
     picture = np.concatenate([np.full((16, 32, 3), 0.5), np.full((16, 32, 3), 0.1)]).astype(np.float32)
     wanted = np.full((16, 32, 3), 0.6, np.float32)

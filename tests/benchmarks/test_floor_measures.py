@@ -28,7 +28,7 @@ def noise(size: int, seed: int) -> np.ndarray:
 
 
 def test_detail_is_one_for_independent_noise_and_small_after_a_blur(measures: ModuleType) -> None:
-    """The gradient energy of white noise does not depend on the draw; pixels outside the mask do not count."""
+    """The gradient energy of white noise does not depend on the seed; pixels outside the mask do not count."""
     truth, mask = noise(96, 0), disc(96, 36)
     assert measures.gradient_energy(noise(96, 1), truth, mask) == pytest.approx(1.0, abs=0.05)
     blurred = ndimage.gaussian_filter(truth, (2.0, 2.0, 0.0))
@@ -37,10 +37,10 @@ def test_detail_is_one_for_independent_noise_and_small_after_a_blur(measures: Mo
 
 
 def test_psnr_prefers_the_blurred_image_and_coarse_psnr_does_not(measures: ModuleType) -> None:
-    """Compare independent noise and its mean before and after a blur.
+    """Compare an independent noise image and a constant image of the mean colour with the true noise.
 
-    Independent noise has twice the squared error of its mean, 3.01 dB; a blur removes that difference only where images
-    agree on a coarse scale, and a wrong colour stays wrong.
+    The independent noise has twice the squared error of the mean, 3.01 dB. After a blur it agrees with the truth; a
+    wrong colour remains an error.
     """
     truth, other, mask = noise(128, 0), noise(128, 1), disc(128, 50)
     mean = np.full_like(truth, 0.5)
@@ -54,8 +54,8 @@ def test_psnr_prefers_the_blurred_image_and_coarse_psnr_does_not(measures: Modul
 def test_shifted_true_floor_finds_its_period_and_no_more(measures: ModuleType) -> None:
     """Score shifted floors of stripes and of noise.
 
-    A floor of stripes fits itself at whole periods; noise scores the 7.8 dB of two independent draws (squared error
-    1/6), and a floor without known surroundings gives no score.
+    A striped floor shifted by whole periods equals itself. Two independent noise images have a squared error of 1/6,
+    which is 7.8 dB. A floor without known surroundings has no score.
     """
     hole, known = disc(120, 15), np.ones((120, 120), bool)
     stripes = np.repeat((np.arange(120) // 3 % 2)[None, :, None].astype(float), 120, axis=0).repeat(3, axis=2)

@@ -1,4 +1,4 @@
-"""Fits, bins and aims of the frame benchmark."""
+"""Power-law fits, bins and aims of the benchmark of frame times."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ def frame(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def records(scale: float = 1.0) -> list[dict[str, Any]]:
-    """Records of steps whose ``solve`` takes 1e-3 n^1.5 c^0.5 ms and whose ``qp`` takes 0.1 c ms."""
+    """Return records of steps with n nodes and c contacts, in which ``solve`` takes ``scale`` 1e-3 n^1.5 c^0.5 ms and
+    ``qp`` takes 0.1 c ms."""
     made = []
     for nodes in (250, 541, 1000):
         for contacts in (0, 4, 8, 12, 30):
@@ -41,7 +42,8 @@ def test_steps_are_grouped_by_their_contacts(frame: ModuleType) -> None:
 
 
 def test_aims(frame: ModuleType) -> None:
-    """541 nodes take 35.7 ms on average, a tenth of 360 ms but not of 350 ms; captures count like the pawn."""
+    """A step with 541 nodes takes 35.7 ms on average: less than a tenth of 360 ms, but more than a tenth of 350 ms. The
+    aim holds for captures as well as for the pawn."""
     for old, fast in ((360.0, True), (350.0, False)):
         aims = frame.summary(records(), old, "cpu")["aims"]
         assert (aims["cpu_541"], aims["cpu_10x"], aims["cpu_250_realtime"]) == (True, fast, True)
@@ -54,7 +56,7 @@ def test_aims(frame: ModuleType) -> None:
 
 
 def test_aims_of_a_gpu(frame: ModuleType) -> None:
-    """1,000 nodes take 88 ms at scale 1 and 12.4 ms at 0.13; 541 nodes take 35.7 ms and 5.6 ms."""
+    """At scale 1, a step takes 88 ms with 1,000 nodes and 35.7 ms with 541; at scale 0.13, 12.4 ms and 5.6 ms."""
     slow, fast = (frame.summary(records(scale), None, "cuda:0")["aims"] for scale in (1.0, 0.13))
     assert slow["cpu_541"] is fast["cpu_541"] is None
     assert (slow["gpu_541"], slow["gpu_1000"], slow["gpu_frame_60hz"]) == (False, False, None)

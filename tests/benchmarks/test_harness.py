@@ -1,4 +1,4 @@
-"""Harness of the benchmarks: every script has its flags and writes table, JSON and image."""
+"""Harness of the benchmarks: every script accepts the common flags and writes a table, JSON and an image."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from PIL import Image
 from tests.support.scripts import BENCHMARKS, module_of
 
 SCRIPTS = sorted(path.stem for path in BENCHMARKS.glob("*.py") if "\ndef main(" in path.read_text())
-"""Scripts that can be run; the other modules are shared by them."""
+"""Names of the benchmark scripts; the other modules of the folder have no ``main``."""
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def test_there_are_benchmarks() -> None:
 
 
 def test_benchmark_outputs(harness: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Print a table with its header, and write JSON of the agreed form and an image."""
+    """The harness prints a table with a header and writes a JSON file and an image."""
     files = {"json": tmp_path / "figures.json", "plot": tmp_path / "picture.png"}
     asked = ["--quick", "--seed", "3", "--json", str(files["json"]), "--plot", str(files["plot"])]
     options = harness.flags("What.", quick="less", device="cpu").parse_args(asked)
@@ -79,7 +79,7 @@ def test_benchmark_outputs(harness: ModuleType, tmp_path: Path, capsys: pytest.C
 
 
 def test_picture_of_floats(harness: ModuleType, tmp_path: Path) -> None:
-    """An image of floats from 0 to 1 is written in bytes, rounded and clipped."""
+    """Pixel values are floats from 0 to 1; they are clipped, rounded and written as bytes."""
     options = harness.flags("What.", quick="less", device="cpu").parse_args(["--plot", str(tmp_path / "p.png")])
     harness.report(options, [], aims={}, picture=np.full((2, 2, 3), [0.5, 1.7, -1.0]))
     with Image.open(tmp_path / "p.png") as picture:

@@ -1,4 +1,4 @@
-"""Figures of parallel worlds: targets, reasons for missing values, and a row of a small run."""
+"""Benchmark of parallel worlds: targets, reasons for missing values, and the row of a small run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pushes that a body withstands: bisection finds the largest one, and the aims judge it."""
+"""Largest push that a body withstands: found by bisection, and compared with the aims."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Procedural rooms: their solids, and that the truth fits the capture."""
+"""Procedural rooms: samples on their solids, and annotations that agree with the capture."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def scenes(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_samples_are_even_on_the_surface(scenes: ModuleType) -> None:
-    """Points of an ellipsoid satisfy its equation and their normals are its gradients; each half of a long one has
-    half of the points. A box has points in proportion to the area of each face."""
+    """Points of an ellipsoid satisfy its equation, and their normals are along its gradient. The number of points of an
+    ellipsoid's middle part and of each pair of faces of a box is proportional to the area."""
     random, half = np.random.default_rng(0), np.array([0.2, 0.3, 1.0])
     one = scenes.solids.ellipsoid((1, 2, 3), half, (0.5, 0.5, 0.5), tilt=40.0)
     samples = one.samples(0.03, random)
@@ -27,7 +27,7 @@ def test_samples_are_even_on_the_surface(scenes: ModuleType) -> None:
     np.testing.assert_allclose(((local / half) ** 2).sum(axis=1), 1.0, atol=1e-9)
     gradient = local / half**2
     np.testing.assert_allclose(normals, gradient / np.linalg.norm(gradient, axis=1, keepdims=True), atol=1e-9)
-    # The area of this spheroid up to z is 2 pi a times the integral of sqrt(1 - (1 - a^2) z^2).
+    # Reference: the area of a spheroid up to z is 2 pi a times the integral of sqrt(1 - (1 - a^2) z^2).
     assert (np.abs(local[:, 2]) < 0.5).mean() == pytest.approx(0.4798 / 0.8056, abs=0.02)
     assert len(local) == pytest.approx(4.0 * np.pi * 0.25 * 0.8056 / 0.03**2, rel=0.02)
     assert not one.contains(samples.points + 1e-6 * samples.normals).any()
@@ -37,7 +37,7 @@ def test_samples_are_even_on_the_surface(scenes: ModuleType) -> None:
 
 
 def test_there_are_twenty_rooms(scenes: ModuleType) -> None:
-    """At least 20, with all toys, on every kind of support and beside every kind of neighbour."""
+    """At least 20 rooms have layouts with all toys, all kinds of support and all kinds of neighbours."""
     layouts = scenes.SCENES.values()
     assert len(layouts) >= 20 and {layout.toy for layout in layouts} == set(scenes.solids.TOYS)
     assert {"duvet", "floor", "carpet", "grass", "table", "chair", "sofa", "shelf"} == {
@@ -49,8 +49,9 @@ def test_there_are_twenty_rooms(scenes: ModuleType) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bear_duvet_wall_wardrobe", "dog_grass_toys"])
 def test_a_room_and_its_truth(scenes: ModuleType, name: str) -> None:
-    """Equal arguments give equal bits. The object is in the middle of every annotated photo, and the outline is that of
-    the labelled Gaussians; the cameras are upright."""
+    """Equal arguments give equal bits, and another seed gives another scene. The labelled Gaussians are centred within
+    a quarter of the size of every annotated photo; masks of object and occluders do not overlap; the cameras are
+    upright."""
     scene, again = (scenes.build_scene(name, density=0.3, device="cpu") for _ in range(2))
     for array in ARRAYS:
         np.testing.assert_array_equal(getattr(scene.cloud, array).numpy(), getattr(again.cloud, array).numpy())

@@ -62,7 +62,7 @@ def test_outlines_within_outlines_are_holes(annotated: ModuleType) -> None:
 
 
 def test_overlap_counts_missing_and_excess_pixels(annotated: ModuleType, clicking: ModuleType) -> None:
-    """Compare a ball with its own outline, and with one that is shifted by its radius."""
+    """Compare the selected Gaussians of a ball with its own outline, and with an outline shifted by 8 pixels."""
     ball = round_ones(shell(), 0.03)
     cloud = concatenate(ball, lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.05)))
     camera = front()
@@ -79,7 +79,8 @@ def test_overlap_counts_missing_and_excess_pixels(annotated: ModuleType, clickin
 
 
 def test_overlap_ignores_hidden_pixels(annotated: ModuleType, clicking: ModuleType) -> None:
-    """Something hides the left half of a ball: that half is neither in excess nor missing."""
+    """Pixels that are annotated as hidden are neither in excess nor missing; without the annotation, they are in
+    excess."""
     ball = round_ones(shell(), 0.03)
     camera = front()
     own = clicking.render_gaussians(ball, camera).alpha.numpy() > 0.5

@@ -1,4 +1,4 @@
-"""Frames and figures of Table 2: every strategy gets the same programs and solves all of them."""
+"""Frames and measures of Table 2: every strategy gets the same programs and solves all of them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def table2(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def assert_coulomb(program: CoulombProgram, x: np.ndarray) -> None:
-    """Assert Eq. (9), with the exact cone."""
+    """Assert that ``x`` satisfies Eq. (9) with the exact friction cone."""
     forces = x[program.activation_count :].reshape(-1, 3)
     speeds = (program.rows @ x + program.offset).reshape(-1, 3)
     pull, slip = np.linalg.norm(forces[:, 1:], axis=1), np.linalg.norm(speeds[:, 1:], axis=1)
@@ -31,7 +31,8 @@ def assert_coulomb(program: CoulombProgram, x: np.ndarray) -> None:
 
 
 def test_every_strategy_finds_a_point_of_every_random_program(table2: ModuleType) -> None:
-    """No strategy beats the optimum of its friction law; the search over modes starts from the true contact."""
+    """No strategy has a lower objective than the optimum of its friction law; the search over modes starts from exact
+    contact."""
     frames = table2.random_frames(30, 0)
     for frame in frames:
         at_rest = np.concatenate([frame.predicted.activations, frame.predicted.forces.ravel()])

@@ -23,7 +23,8 @@ BUILD = runpy.run_path(str(ROOT / ".ci" / "blender_extension.py"))["build"]
 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModuleType]:
-    """The module ``performance`` of the zip; without ``__init__``, which needs Blender."""
+    """Import the module ``performance`` from the zip. The package's ``__init__`` is left out because it needs
+    Blender."""
     folder = tmp_path_factory.mktemp("zip")
     with zipfile.ZipFile(BUILD(folder)) as archive:
         archive.extractall(folder / "unpacked_extension")

@@ -49,7 +49,7 @@ def extension(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def blender(*arguments: str | Path, home: Path) -> str:
-    """Run Blender's Python with settings of its own; return what it printed."""
+    """Run Blender's Python with its settings in the folder ``home``; return its output."""
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(home)}
     environment.pop("PYTHONPATH", None)
     command = [PYTHON, *map(str, arguments)]
@@ -144,7 +144,8 @@ def test_the_picture_is_that_of_the_film(session: Path, run: FinishedRun) -> Non
 
 
 def test_edited_muscles_and_cage_run(session: Path, results: dict[str, Any], run: FinishedRun, tmp_path: Path) -> None:
-    """The cage is 1.05 times as wide; of the muscles, one was removed, one moved and one added."""
+    """A run accepts the edited cage, which is 1.05 times as wide, and the edited muscles: one was removed, one moved
+    and one added."""
     assert results["export"] == results["export of the cage"] == ["FINISHED"]
     path = session / "muscles.json"
     fibres = json.loads(path.read_text())["fibres"]

@@ -154,8 +154,8 @@ def test_bad_files_are_one_line(text: str, said: str, tmp_path: Path, capsys: py
 
 @pytest.mark.parametrize("way", ["lists", "merged"])
 def test_short_files_that_expand_to_billions_of_values(way: str, tmp_path: Path) -> None:
-    """Nine levels of nested aliases, quoted in an error message, or keys merged as often: expanded, neither fits into
-    memory."""
+    """Eleven levels of nested YAML aliases or merged keys would not fit into memory if they were expanded; the error
+    message does not expand them."""
     inner = {"lists": "[z, z]", "merged": "{up: z}"}[way]
     lines = [f"a0: &a0 {inner}"]
     for level in range(1, 12):

@@ -1,4 +1,4 @@
-"""Conversion of captures: exactly the reported losses occur."""
+"""Conversion of captures: the reported losses are the actual ones."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ def test_a_capture_becomes_another(kind: str, tmp_path: Path, capsys: pytest.Cap
 
 
 def test_reported_losses_are_the_actual_ones(tmp_path: Path) -> None:
-    """Known changes in a shuffled order, a larger one of a single Gaussian, and Gaussians that are gone."""
+    """The report is correct for Gaussians in a shuffled order with known changes, of which one is much larger, and for
+    missing Gaussians."""
     cloud = make_cloud(500, 1)
     order = np.random.default_rng(0).permutation(500)
     means = cloud.means.numpy() + np.array([0.003, 0.0, 0.0])
@@ -65,7 +66,8 @@ def test_reported_losses_are_the_actual_ones(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_each_gaussian_is_compared_with_itself(kind: str, tmp_path: Path) -> None:
-    """Also where the file has another order: an outline of look-alikes would hide that all are displaced."""
+    """The reported errors are those of corresponding Gaussians, also in formats that change the order. Comparing
+    nearest Gaussians instead would hide a displacement of all."""
     cloud = make_cloud(300)
     path = tmp_path / f"a{WRITERS[kind].ending}"
     order = WRITERS[kind](path, cloud)
@@ -118,7 +120,7 @@ def test_spz_of_any_size_keeps_its_shape_or_is_refused(
 
 
 def test_offsets_are_kept_or_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A georeferenced capture, through formats with and without a place for its offset."""
+    """The offset of a georeferenced capture is kept by .ply and .glb; its loss in .spz is reported."""
     place = np.array([431000.0, 5403000.0, 120.0])
     write_ply(tmp_path / "a.ply", make_cloud(100), origin=place)
     for name in ("b.ply", "b.glb", "b.spz"):
@@ -141,7 +143,8 @@ def test_offsets_are_kept_or_reported(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_an_offset_that_is_read_as_another_one_is_no_loss(
     place: tuple[float, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A .ply holds positions with the offset: none is read if single precision suffices, or a rounder one."""
+    """A .ply stores positions that include the offset. The reader finds no offset if single precision suffices,
+    otherwise a rounded one; absolute positions stay the same."""
     write_glb(tmp_path / "a.glb", make_cloud(100), origin=np.array(place))
     assert main(["convert", str(tmp_path / "a.glb"), str(tmp_path / "b.ply")]) == 0
     said = capsys.readouterr()
@@ -260,7 +263,7 @@ def test_up_turns_with_the_capture(
     vertical_axis: int | None,
     tmp_path: Path,
 ) -> None:
-    """A given up direction is turned to +y first, then by the rotation."""
+    """A given up direction is first rotated to +y; then the given rotation is applied."""
     values: dict[str, Any] = {name: np.array(value) if name != "scale" else value for name, value in edits.items()}
     chosen = CaptureEdits(**values)
     capture = _capture(tmp_path / "a.ply", *comments)

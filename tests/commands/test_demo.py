@@ -1,4 +1,4 @@
-"""``egs-warp demo``: it films the hops of the README, and never touches an earlier run."""
+"""``egs-warp demo``: it films the hops of the README and does not change an earlier run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``egs-warp from-photos``: a ball on a floor, from photos to a film; reconstruction is a substitute."""
+"""``egs-warp from-photos``: from photos of a ball on a floor to a film, with a substitute for COLMAP."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Photos:
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Photos]:
-    """Six photos of 96 pixels."""
+    """Render six photos of 96 x 96 pixels."""
     folder = tmp_path_factory.mktemp("from-photos")
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.4]), 1.1, count=6, size=96)
     (folder / "photos").mkdir()

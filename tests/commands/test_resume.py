@@ -25,11 +25,11 @@ from tests.support.coarse import coarse_main
 from tests.support.disk_faults import assert_one_line, fail_once
 
 PATIENCE = 900.0
-"""Seconds that a run may take on a busy machine."""
+"""Maximum time of a run on a busy machine, s."""
 MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "1"))
-"""Times at which each command is killed once; by default the short form of docs/reliability.md."""
+"""Number of random times at which each command is killed; the default is the short form of docs/reliability.md."""
 SEED = os.environ.get("EGS_WARP_SEED", "")
-"""Seed of the times, so that several processes can test different ones."""
+"""Seed of the random times, so that several processes can test different ones."""
 SMALL = ("--up", "z", "--size", "32")
 COMMANDS = {
     "jump": ("pawn.ply", "--frames", "28"),
@@ -102,8 +102,8 @@ def ended_by(arguments: Sequence[str], number: int, ready: Path, after: float) -
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_repeatedly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The run is killed by SIGKILL and by Ctrl-C before its first part, between parts and in the video. Runs that need
-    not be killed execute in this process."""
+    """The run is killed by SIGKILL before its first part, by Ctrl-C between parts, and by SIGKILL after the simulation.
+    Runs that are not killed execute in this process."""
     folder, whole, out = write_inputs(tmp_path), tmp_path / "whole", tmp_path / "out"
     assert coarse_main(animate("jump", folder, whole)) == 0
     parts = out / "trajectory.parts"

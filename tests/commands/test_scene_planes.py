@@ -19,8 +19,8 @@ from tests.support.scenes import FLOOR, ball_on_floor
 
 
 def test_further_planes_are_level_patches_in_their_own_colours() -> None:
-    """Beside the floor of a bedroom, only the stool's board and cushion are level; slices of walls and legs are not
-    planes."""
+    """Apart from the floor, only the stool's board and cushion are level planes of the bedroom; slices of walls and
+    legs are not reported."""
     made = scene("stool")
     cloud = concatenate(made.background, made.object)
     given = SceneInput(cloud, [], ObjectSpec(point=np.array([0.0, 0.0, 0.68])), None, made.plane, ())

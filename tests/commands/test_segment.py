@@ -1,4 +1,4 @@
-"""The commands from a scene to its parts: their files, and a one-line error for every mistake."""
+"""The commands ``plane``, ``segment`` and ``inpaint``: their files, and a one-line error for every mistake."""
 
 from __future__ import annotations
 

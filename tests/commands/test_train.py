@@ -23,7 +23,7 @@ OFTEN = (
     "import sys; from egs_warp.training import checkpoint; checkpoint.SECONDS = 0.0;"
     " from egs_warp.cli import main; sys.exit(main(sys.argv[1:]))"
 )
-"""The command with checkpoints as frequent as possible."""
+"""Python code that runs the command and writes checkpoints as often as possible."""
 
 
 def line(folder: Path, out: Path, device: str = "cpu") -> list[str]:
@@ -65,7 +65,7 @@ def test_ctrl_c_prints_how_to_continue(
 
 
 def test_an_earlier_training_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The report and the sheet, which no flag names, are protected, too."""
+    """The report and the contact sheet are protected, too, although no flag names them."""
     posed, out = posed_folder(tmp_path / "posed"), tmp_path / "a.ply"
     (tmp_path / "a.sheet.png").write_bytes(b"sheet")
     assert main(line(posed, out)) == 2
@@ -81,9 +81,11 @@ def test_an_earlier_training_is_not_overwritten(tmp_path: Path, capsys: pytest.C
 
 @pytest.mark.slow
 def test_random_moments(tmp_path: Path, device: str) -> None:
-    """SIGKILL at any time, every other one after the first checkpoint; without a checkpoint the training starts again.
+    """The training is killed by SIGKILL at random times, half of them after the first checkpoint. Without a checkpoint
+    it starts again.
 
-    The capture is bitwise that of an uninterrupted training, also on a GPU, because no float sums are atomic.
+    The capture is bitwise equal to that of an uninterrupted training, also on a GPU, because floating-point sums are
+    not atomic.
     """
     posed, whole = posed_folder(tmp_path / "posed"), tmp_path / "whole" / "a.ply"
     command = [sys.executable, "-c", OFTEN]

@@ -46,7 +46,7 @@ def states(creature: Creature) -> list[BodyState]:
 
 @pytest.fixture(scope="module")
 def activations(creature: Creature) -> np.ndarray:
-    """(5, M) m, random contractions and extensions."""
+    """Return random activations (5, M), m: contractions and extensions."""
     shares = np.random.default_rng(1).uniform(-0.2, 0.6, (len(FRICTIONS), creature.muscles.segment_count))
     return shares * creature.muscles.bounds
 
@@ -65,7 +65,7 @@ def solved_alone(
 
 
 def lowest_points(points: ContactSelector, gaps: np.ndarray) -> np.ndarray:
-    """The lowest point of each cell that is below the ground, in ascending order."""
+    """Return the indices, in ascending order, of the lowest point below the ground of each cell."""
     high = np.full_like(gaps, np.inf)
     return np.sort(points.find_penetrating(np.zeros(0, int), gaps, high, 1e-12))
 
@@ -73,8 +73,8 @@ def lowest_points(points: ContactSelector, gaps: np.ndarray) -> np.ndarray:
 def solved_together(
     creature: Creature, states: list[BodyState], activations: np.ndarray, dt: float, *, few: bool = False
 ) -> tuple[ContactSet, ContactSet, BatchResult]:
-    """Return the contacts at the start and at the end, and the result. The start contacts are the points that touch the
-    ground in free motion; with ``few`` only a third of them."""
+    """Return the contacts at the start and at the end, and the result. The contacts at the start are the points that
+    would touch the ground in a ballistic step; with ``few``, only a third of them."""
     one, count = creature.stepper.solver, len(states)
     detector = ContactDetector(creature.geometry, device="cpu")
     beside = BatchSolver(
@@ -113,8 +113,8 @@ def solved_together(
 def test_results_equal_those_of_each_world_alone(
     creature: Creature, states: list[BodyState], activations: np.ndarray, few: bool
 ) -> None:
-    """From the points that touch in free motion, or from a third of them so that many are added during the solve: the
-    velocities, the points in their order, the forces and the iteration count are equal."""
+    """The velocities, the points in their order, the nodal forces and the iteration count are equal. The solve starts
+    from all points that touch the ground in a ballistic step, or from a third of them, so that many are added."""
     body = creature.body
     dt = body.time_unit / 20.0
     contacts, touched, made = solved_together(creature, states, activations, dt, few=few)
@@ -128,7 +128,7 @@ def test_results_equal_those_of_each_world_alone(
         assert alone.converged and not made.is_singular[world]
         np.testing.assert_allclose(made.velocities[world].numpy(), alone.velocities, atol=1e-9 * body.speed_unit)
         forces = made.forces[world, :n].numpy()
-        # Redundant points can share a load in several ways.
+        # The distribution of a load over redundant points is not unique.
         nodal = [alone.contacts.nodal_forces(each) for each in (forces, alone.forces)]
         np.testing.assert_allclose(*nodal, rtol=0, atol=1e-6 * body.weight)
         joined += n - len(chosen)
@@ -178,7 +178,7 @@ def test_a_world_without_a_usable_tangent_stops_at_once(creature: Creature) -> N
 
 
 def test_normal_bias_equals_that_of_one_world(creature: Creature, states: list[BodyState]) -> None:
-    """The push-out speeds are equal up to the cap; capacity without a contact has no bias."""
+    """The normal biases equal those of ``push_out_speeds``, including the speed limit; unused slots are zero."""
     one, dt = creature.stepper.solver, 0.01
     detector = ContactDetector(creature.geometry, device="cpu")
     beside = BatchSolver(detector, one.points, push_out_cap=0.05, penetration_tolerance=0.01, tolerance=1e-8)

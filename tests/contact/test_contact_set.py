@@ -1,4 +1,4 @@
-"""Products with the contact Jacobian; contacts of many worlds equal those of one."""
+"""Contacts of many worlds, their frames and products with their Jacobians equal those of a single world."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def detector(geometry: ContactGeometry) -> ContactDetector:
 
 @pytest.fixture(scope="module")
 def positions() -> np.ndarray:
-    """(4, N, 3) positions of a body that stands, leans, lies deep in the ground, and flies."""
+    """Return node positions (4, N, 3), m, of a body that stands, leans, penetrates the ground, and flies."""
     nodes, random = coarse_pawn().start.positions, np.random.default_rng(0)
     lean = nodes + 0.1 * nodes[:, 2:] * np.array([1.0, 0.0, -0.2])
     deep = nodes + 1e-3 * random.normal(size=nodes.shape) - np.array([0.0, 0.0, 0.02])
@@ -48,7 +48,7 @@ def points_of(contacts: ContactSet, world: int) -> np.ndarray:
 
 
 def contacts_within(detector: ContactDetector, positions: np.ndarray, distance: float) -> ContactSet:
-    """The contacts of all points closer than ``distance`` to the ground."""
+    """Return the contacts of all points less than ``distance`` m above the ground."""
     places = torch.from_numpy(positions)
     gaps, faces = detector.gaps_of_worlds(places)
     order = torch.argsort((gaps >= distance).int(), dim=1, stable=True).int()
@@ -58,7 +58,8 @@ def contacts_within(detector: ContactDetector, positions: np.ndarray, distance: 
 def test_selection_equals_that_of_one_world_in_every_step(
     points: ContactSelector, detector: ContactDetector, positions: np.ndarray
 ) -> None:
-    """In three steps, points are added, retained because of their load, removed, and joined by deeper ones."""
+    """The selection and the points that penetrate during a step are equal in three steps, in which points are added,
+    retained because of their load, and removed."""
     random = np.random.default_rng(1)
     before = [np.zeros(0, int)] * WORLDS
     loads, joins = [np.zeros(0)] * WORLDS, 0

@@ -1,5 +1,5 @@
-"""Contact forces for a given Delassus operator: the sweeps against a slow reference, and solutions where tangents
-differ. ``test_detection.py`` tests Coulomb's law itself.
+"""Contact forces for a given Delassus operator: block Gauss-Seidel sweeps against a slow reference, and solutions for
+anisotropic tangential compliance. ``test_detection.py`` tests Coulomb's law itself.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def problem(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 def swept_twin(
     delassus: np.ndarray, free: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray, sweeps: int
 ) -> np.ndarray:
-    """Sweep contact by contact: the normal force that stops the approach, then the tangential forces, projected onto
-    the cone."""
+    """Return the forces (n, 3) after block Gauss-Seidel sweeps: for each contact the normal force that stops the
+    approach, then the tangential force, projected onto the cone."""
     f = start.ravel().copy()
     for _ in range(sweeps):
         for n in range(0, 3 * COUNT, 3):
@@ -52,7 +52,8 @@ def swept_twin(
 @pytest.mark.parametrize("sweeps", [1, 3])
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
 def test_sweeps_equal_their_twin(friction: float, sweeps: int) -> None:
-    """Eq. (8), (9): equal to rounding for separating, sticking and sliding contacts."""
+    """Eq. (8), (9): the forces equal those of the reference to rounding, for separating, sticking and sliding
+    contacts."""
     kinds = set()
     for seed in range(60):
         delassus, free, shift, start = problem(seed)
@@ -89,7 +90,7 @@ def test_solutions_obey_coulombs_law_for_different_tangents(friction: float) -> 
 
 
 def test_nan_problems_return_the_initial_forces() -> None:
-    """The residual of a failed solve is infinite."""
+    """The residual of such a problem is infinite, and the initial normal forces are returned."""
     delassus, free, shift, start = problem(0)
     free[4] = np.nan
     forces, size = coulomb_forces(delassus, free, shift, 0.5, start)
@@ -118,8 +119,8 @@ def test_batched_problems_have_the_bits_of_single_ones() -> None:
 
 
 def test_batched_problems_at_the_iteration_limit_have_the_bits_of_single_ones() -> None:
-    """20 sticking points with 30 degrees of freedom: some problems are not solved within the iteration limit, in a
-    batch as alone."""
+    """For 20 sticking points with 30 degrees of freedom, some problems are not solved within the iteration limit. Their
+    results in a batch are bitwise equal to those of single solves."""
     count, friction, problems = 20, 1.5, []
     for seed in range(40):
         random = np.random.default_rng(seed)
@@ -138,7 +139,8 @@ def test_batched_problems_at_the_iteration_limit_have_the_bits_of_single_ones() 
 @pytest.mark.cuda
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
 def test_a_thread_block_finds_the_forces_of_a_single_thread(friction: float) -> None:
-    """Full and partial groups; numbers of unknowns up to the capacity of one pass and above it."""
+    """Compare a thread block with a single thread for full and partial groups of contacts, with up to and more unknowns
+    than one pass holds."""
     counts, room = [1, 4, 5, 6, 11, 33, 40, 45, 64, 65, 70], 70
     random = np.random.default_rng(1)
     delassus, free = np.zeros((len(counts), 3 * room, 3 * room)), random.normal(size=(len(counts), 3 * room))
@@ -158,8 +160,8 @@ def test_a_thread_block_finds_the_forces_of_a_single_thread(friction: float) -> 
 @pytest.mark.cuda
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
 def test_a_thread_block_finds_the_forces_of_many_loaded_contacts(friction: float) -> None:
-    """Numbers of unknowns above the capacity of one pass: full and partial passes and tiles, more unknowns than all
-    passes hold, and more contacts than one block sweeps."""
+    """The numbers of unknowns exceed the capacity of one pass: they give full and partial passes and tiles, more
+    unknowns than all passes hold, and more contacts than one block sweeps."""
     counts, room = [41, 42, 43, 50, 53, 62, 64, 65, 80, 85, 86, 100, 130], 130
     random = np.random.default_rng(4)
     delassus, free = np.zeros((len(counts), 3 * room, 3 * room)), random.normal(size=(len(counts), 3 * room))
@@ -181,8 +183,8 @@ def test_a_thread_block_finds_the_forces_of_many_loaded_contacts(friction: float
 
 
 def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
-    """25 points with 12 degrees of freedom, regularised as in a step, under normal, tangential and rotational load. The
-    equations hold, and no force is large."""
+    """25 points with 12 degrees of freedom, regularised as in a step, are under normal, tangential and rotational load.
+    The equations hold, and the sum of all forces is bounded."""
     random = np.random.default_rng(2)
     place = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 5), np.linspace(-1.0, 1.0, 5)), axis=-1).reshape(-1, 2)
     corners = np.stack([(1 - place[:, 0]) * (1 - place[:, 1]), (1 + place[:, 0]) * (1 - place[:, 1])], axis=1)
@@ -198,7 +200,8 @@ def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
 
 
 def test_earlier_problems_do_not_change_the_result() -> None:
-    """Memory is reused: the bits are the same after a problem with NaN, and after one that used all attempts."""
+    """The solver reuses its workspace; results are bitwise equal after a problem with NaN and after one that used all
+    attempts."""
     delassus, free, shift, start = problem(1)
     expected, missed = coulomb_forces(delassus, free, shift, 0.4, start)
     assert missed < 1e-10 and np.abs(expected).max() > 0.1
@@ -209,9 +212,8 @@ def test_earlier_problems_do_not_change_the_result() -> None:
 
 
 def test_more_points_than_nodes_are_solved_by_continuation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """First step of a jump on 32 points of a coarse foot, from muscles at rest to those of the whole step. From the
-    present forces the kernel alone does not converge; continuation from compliant contacts does, also for many
-    worlds.
+    """The problems are those of the first step of a jump on 32 points of a coarse foot. The Newton kernel alone does
+    not converge from the current forces; continuation from compliant contacts does, also for many worlds.
     """
     creature = sagging(coarse_pawn())
     first = simulate(creature, motion("jump"), frames=2).simulation.reports[0]

@@ -37,8 +37,8 @@ def block(
     slope: float = 0.0,
     lift: float = 0.0,
 ) -> PassiveBody:
-    """A soft block with 25 contact points under its base and four at its top, ``lift`` metres above a floor that slopes
-    down towards +x by ``slope`` radians: gravity is rotated instead of the floor."""
+    """Create a soft block with 25 contact points at its base and four at its top, ``lift`` metres above a floor that
+    slopes down towards +x by ``slope`` radians. Gravity is rotated instead of the floor."""
     level = make_body(mesh or block_mesh(), FLOOR, sag=sag, damping_ratio=damping_ratio, device="cpu")
     gravity = 9.81 * np.array([np.sin(slope), 0.0, -np.cos(slope)])
     body = SoftBody(level.mesh, level.assembly, level.node_mass, gravity, level.height)
@@ -50,8 +50,8 @@ def block(
 
 
 def assert_obeys(standing: PassiveBody, before: BodyState, problem: StepProblem, result: CoupledResult) -> None:
-    """Assert contact, Coulomb's law with the stored velocities, maximal dissipation, and the balance of both
-    momenta."""
+    """Assert that the result satisfies normal complementarity, Coulomb's law, maximal dissipation, and the balances of
+    linear and angular momentum."""
     body, friction = standing.body, standing.solver.detector.geometry.friction
     contacts, forces = result.contacts, result.forces
     assert result.converged and result.residual < 1e-8
@@ -89,7 +89,7 @@ def test_a_block_comes_to_rest_and_every_step_obeys_coulombs_law(push: float) ->
         before = falling.state
         problem, result = falling.advance(DT)
         assert_obeys(falling, before, problem, result)
-    # The pushed block still sways when its base has come to rest.
+    # The base of the pushed block comes to rest while the block still vibrates.
     speed = (result.contacts.jacobian @ result.velocities.ravel()).reshape(-1, 3)
     assert np.abs(speed[:, 1:]).max() < 5e-3 * scale
     if push == 0.0:
@@ -184,8 +184,8 @@ def test_a_resting_body_neither_sinks_nor_creeps(degrees: float) -> None:
 
 
 def test_a_sliding_block_stops_and_stays() -> None:
-    """Eq. (9): from speed v a stiff flat block slides v^2 / (2 mu g), minus half a step's displacement, and then
-    sticks."""
+    """Eq. (9): a stiff flat block with the initial speed v slides by v^2 / (2 mu g) minus half of its displacement in
+    the first step, and then sticks."""
     friction, speed = 0.5, 1.5
     sliding = block(friction, sag=0.002, mesh=block_mesh(4, 4, 3, (0.8, 0.8, 0.3)))
     body = sliding.body
@@ -247,7 +247,7 @@ def test_points_that_would_penetrate_join_the_set() -> None:
 
 
 def test_points_join_before_the_step_without_them_has_converged(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Early activation adds the same points and gives the same result in fewer iterations."""
+    """With early activation, the solve ends with the same points in fewer iterations."""
     falling = block()
     _, soon = on_one_corner(falling)
     monkeypatch.setattr(coupled_step, "ACTIVATION_RESIDUAL", 0.0)
@@ -258,8 +258,8 @@ def test_points_join_before_the_step_without_them_has_converged(monkeypatch: pyt
 
 
 def test_a_tangent_that_yields_no_descent_is_replaced() -> None:
-    """The tangent of a body with no stiffness and a billionth of the mass inverts elements at any step length. The
-    result is that of the body's own tangent, which is computed once."""
+    """The tangent of a body without stiffness and with a billionth of the mass inverts elements at any step length. It
+    is replaced by the body's own tangent, and the end velocities are the same."""
     standing = block()
     body, solver = standing.body, standing.solver
     squashed = BodyState(body.mesh.nodes * [1.0, 1.0, 0.9], np.zeros_like(body.mesh.nodes))
@@ -277,8 +277,8 @@ def test_a_tangent_that_yields_no_descent_is_replaced() -> None:
 
 
 def test_a_linearization_predicts_the_step() -> None:
-    """Eq. (8): columns of known points are reused, and forces change the velocities as the tangent predicts for their
-    impulse."""
+    """Eq. (8): contact forces change the velocities by the solution of the tangent for their impulse. Columns that are
+    passed in again give the same Delassus operator."""
     standing = block()
     x, solver = standing.state.positions @ Rotation.from_rotvec([0.0, 0.1, 0.2]).as_matrix().T, standing.solver
     problem = StepProblem(standing.body, BodyState(x, np.zeros_like(x)), DT)
@@ -295,8 +295,8 @@ def test_a_linearization_predicts_the_step() -> None:
 
 
 def test_predicted_forces_obey_coulombs_law() -> None:
-    """In place of the paper's penalties (Eq. 10, 11), stage 1 has exact contact: normal forces are not negative, forces
-    are within Coulomb's cone, and friction is opposite to the slip, for any free velocities."""
+    """The prediction has exact contact instead of the paper's penalties (Eq. 10, 11). For any free velocities, normal
+    forces are not negative, forces are within Coulomb's cone, and friction is opposite to the slip."""
     standing = block()
     solver, x = standing.solver, standing.state.positions
     problem = StepProblem(standing.body, standing.state, DT)
@@ -338,8 +338,8 @@ def test_a_step_without_new_points_is_solved_once(monkeypatch: pytest.MonkeyPatc
 
 
 def test_forces_that_violate_coulombs_law_end_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The equation of motion alone is not enough. Where the forces violate Coulomb's law, another tangent is tried;
-    then the solve fails, so that the caller takes two half steps."""
+    """A step does not end while its forces violate Coulomb's law, even if the equation of motion holds. Another tangent
+    is tried; then the solve fails, so that the caller takes two half steps."""
     resting, answered = block(sag=0.01, damping_ratio=0.5), responses.coulomb_forces
     for _ in range(5):
         resting.advance(DT)

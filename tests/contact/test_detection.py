@@ -26,7 +26,8 @@ GRAVITY = 9.81
 
 
 def seven_points(cloud: GaussianCloud, gamma: float = 3.0) -> np.ndarray:
-    """(n, 7, 3) mean and the six ends of T+ and T-, one Gaussian at a time (slow reference)."""
+    """Return (n, 7, 3) the mean and the six ends of T+ and T- of each Gaussian, in a loop over Gaussians (slow
+    reference)."""
     rows = []
     for mean, (w, x, y, z), log_scale in zip(
         cloud.means.numpy(), cloud.rotations.numpy(), cloud.log_scales.numpy(), strict=True
@@ -38,8 +39,8 @@ def seven_points(cloud: GaussianCloud, gamma: float = 3.0) -> np.ndarray:
 
 
 def test_hull_points_include_the_lowest_of_all_points(device: str) -> None:
-    """Eq. (3), Eq. (8): over 50 deformations of the cage, the minimum gap of the hull points is that of all 7 n
-    points."""
+    """Eq. (3), Eq. (8): in each of 50 deformations of the cage, the minimum gap of the hull points equals the minimum
+    gap of all 7 n points."""
     mesh = block_mesh()
     cloud = surface_cloud(mesh, 3000, lowest=0.05)
     tilted = (FLOOR, Plane.from_coefficients(0.3, 0.1, 1.0, 0.4))
@@ -55,7 +56,7 @@ def test_hull_points_include_the_lowest_of_all_points(device: str) -> None:
         x = mesh.nodes @ rng.standard_normal((3, 3)) + 0.1 * rng.standard_normal(mesh.nodes.shape)
         points = np.einsum("pw,pwi->pi", weights, x[corners])
         lowest = min(plane.heights(points).min() for plane in tilted)
-        # Means are float32 on both sides; their sums are in different order.
+        # Both sides use float32 means, but sum in a different order.
         assert detector.gaps(x)[0].min() == pytest.approx(lowest, abs=1e-6)
 
 
@@ -73,8 +74,8 @@ def test_gaps_kernel_equals_its_twin(device: str) -> None:
 
 
 def test_gaps_to_a_step_and_a_wall_equal_their_twin(device: str) -> None:
-    """Eq. (8): a step (two faces) and a wall beside the floor; on the step its top face counts, in front of it its
-    riser."""
+    """Eq. (8): gaps to a floor, a step with two faces, and a wall. A point over the step has its gap to the tread, a
+    point in front of the step has it to the riser."""
     mesh = block_mesh()
     low = mesh.nodes.min(axis=0)
     size = np.ptp(mesh.nodes, axis=0)
@@ -96,7 +97,7 @@ def test_gaps_to_a_step_and_a_wall_equal_their_twin(device: str) -> None:
 
 
 def test_endpoints_are_shortened_to_the_plane_at_rest() -> None:
-    """Eq. (3): arms that pass through the plane end on it and keep their direction; the others keep the length gamma
+    """Eq. (3): arms that pass through the plane are shortened to end on it; all other arms have the length gamma
     sigma."""
     mesh = block_mesh()
     mean = np.array([[0.05, 0.02, 0.03]])
@@ -115,7 +116,8 @@ def test_endpoints_are_shortened_to_the_plane_at_rest() -> None:
 
 
 def flat_base(noise: float) -> GaussianCloud:
-    """Return Gaussians inside the block, and discs in its base; all values have an error of up to ``noise``."""
+    """Return Gaussians inside the block, half of them with means in its base; all values have an error of up to
+    ``noise``."""
     rng, off = np.random.default_rng(4), np.random.default_rng(5)
     count = 2000
     means = np.column_stack([rng.uniform(-0.18, 0.18, (count, 2)), rng.uniform(0.0, 0.9, count)])
@@ -129,9 +131,9 @@ def flat_base(noise: float) -> GaussianCloud:
 
 
 def test_grid_points_do_not_depend_on_the_last_bits_of_a_file() -> None:
-    """Points on the grid are not below the floor and are sorted by position. Under rounding errors of single precision,
-    fewer than 0.3 % of them change, and none that touches the floor, although half of the means and arms there lie
-    below it. Without a grid, most points change."""
+    """Points on the grid are not below the floor and are sorted by position. Rounding errors of single precision change
+    fewer than 0.3 % of them, and none on the floor, although half of the means and arms there are then below it.
+    Without a grid, most points change."""
     mesh, grid = block_mesh(), 2.0**-10
 
     def places(noise: float, grid: float | None) -> np.ndarray:
@@ -161,7 +163,7 @@ def test_points_within_an_edge_or_face_of_the_hull_are_no_vertices() -> None:
 
 
 def test_gaussians_below_the_plane_are_left_out_and_counted() -> None:
-    """A Gaussian whose mean lies below the plane is ignored; its fraction of the opacity mass is reported.
+    """A Gaussian with its mean below the plane is ignored; its fraction of the total opacity is reported.
 
     See docs/concepts/contact.md.
     """
@@ -179,8 +181,8 @@ def test_gaussians_below_the_plane_are_left_out_and_counted() -> None:
 
 
 def test_contact_frame_maps_nodes_to_points(device: str) -> None:
-    """Eq. (8): frame rows give the normal and tangential velocity of each point; axes are orthonormal; gaps at the end
-    are linear in the velocities."""
+    """Eq. (8): the Jacobian gives the normal and tangential velocities of each point in an orthonormal frame; the gaps
+    at the end of a step are linear in the velocities."""
     mesh = block_mesh()
     slope = Plane.from_coefficients(0.4, -0.2, 1.0, 0.3)
     geometry = contact_geometry(surface_cloud(mesh, 200, lowest=0.1), mesh, (slope,), device=device)
@@ -204,7 +206,8 @@ def test_contact_frame_maps_nodes_to_points(device: str) -> None:
 
 
 def test_push_out_speed_and_tangent_directions() -> None:
-    """Eq. (8): c = u_n + max(phi, 0) / dt + min(phi + slop, 0) b / dt, the push-out capped; D is a regular star."""
+    """Eq. (8): the bias is max(phi, 0) / dt + min(phi + slop, 0) b / dt with a limited push-out speed. The tangent
+    directions form a regular star."""
     gaps = np.array([0.02, 0.0, -0.004, -1.0])
     assert push_out_speeds(gaps, 0.1, 0.3, 0.5, 0.0).tolist() == pytest.approx([0.2, 0.0, -0.02, -0.3])
     assert push_out_speeds(gaps, 0.1, 0.3, 0.2, 0.003).tolist() == pytest.approx([0.2, 0.0, -0.002, -0.3])
@@ -217,7 +220,7 @@ def test_push_out_speed_and_tangent_directions() -> None:
 def assert_coulomb(
     delassus: np.ndarray, free: np.ndarray, shift: np.ndarray, friction: float, force: np.ndarray, tolerance: float
 ) -> None:
-    """Eq. (9) with the exact cone; ``tolerance`` in m/s."""
+    """Assert Eq. (9) with the exact cone, to ``tolerance`` in m/s."""
     velocity = (free + delassus @ force.ravel()).reshape(-1, 3)
     measure = velocity[:, 0] + shift
     rate = 1.0 / np.diag(delassus).mean()
@@ -228,7 +231,7 @@ def assert_coulomb(
     assert (tangent - friction * force[:, 0]).max() <= 1e-12 * max(force[:, 0].max(), 1.0)
     for f, t, u in zip(force, tangent, velocity[:, 1:], strict=True):
         slip = np.linalg.norm(u)
-        # Maximal dissipation: slip only on the cone, straight against the force.
+        # Maximal dissipation: a slipping contact has its force on the cone, opposite to the slip.
         if slip > 10 * tolerance and f[0] > 10 * tolerance * rate:
             assert t == pytest.approx(friction * f[0], rel=1e-4, abs=tolerance * rate)
             assert f[1:] @ u == pytest.approx(-t * slip, rel=1e-4, abs=tolerance**2 * rate)
@@ -260,7 +263,8 @@ def test_coulomb_forces_on_random_problems(count: int, unknowns: int, friction: 
 
 
 def block_on_incline(angle: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(delassus, speed per second of gravity, arms) of a rigid unit block of 2 kg on its four corners on an incline."""
+    """Return the Delassus operator (12, 12), the contact accelerations by gravity (12,), m/s^2, and the lever arms (4,
+    6) of a rigid unit cube of 2 kg that rests with its four corners on an incline."""
     mass, inertia = 2.0, 2.0 / 6.0 * np.eye(3)
     arms = np.array([[x, y, -0.5] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
     axes = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
@@ -272,8 +276,8 @@ def block_on_incline(angle: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_block_on_an_incline() -> None:
-    """Eq. (9), closed form: sticks while tan < mu,
-    else slides with a = g (sin - mu cos) and friction mu m g cos uphill.
+    """Eq. (9), closed form: the block sticks if tan(angle) < mu. Otherwise it slides with a = g (sin - mu cos), and the
+    friction is mu m g cos, uphill.
     """
     friction, dt = 0.5, 0.01
     for angle in np.radians([5.0, 20.0, 26.0, 27.2, 35.0, 42.0]):
@@ -300,8 +304,8 @@ def test_separating_and_absent_contacts_need_no_force() -> None:
 
 @pytest.mark.parametrize("regularisation", [0.0, 1e-7])
 def test_coulomb_forces_of_forty_points_under_a_rigid_base(regularisation: float) -> None:
-    """Eq. (9): 120 rows of rank 6, sticking, sliding and spinning; all forty points touch, and the net wrench obeys
-    Coulomb's law."""
+    """Eq. (9): a Jacobian of 120 rows with rank 6, for sticking, sliding, spinning and tilting motions of the body. The
+    forces satisfy Coulomb's law and carry the body."""
     rng = np.random.default_rng(5)
     mass, inertia = 2.0, np.diag([0.3, 0.4, 0.2])
     arms = np.column_stack([rng.uniform(-0.5, 0.5, (40, 2)), np.full(40, -0.5)])
@@ -325,7 +329,8 @@ def test_coulomb_forces_of_forty_points_under_a_rigid_base(regularisation: float
 
 
 def test_gaps_are_those_of_the_requested_positions(device: str) -> None:
-    """More configurations than the cache holds, in any order, some changed in place. The cached result is read-only."""
+    """The cached gaps are correct for more configurations than the cache holds, in any order, and for arrays that were
+    changed in place. Cached results are read-only."""
     mesh = block_mesh()
     geometry = contact_geometry(surface_cloud(mesh, 50, lowest=0.05), mesh, (FLOOR,), device=device)
     kept, place = ContactDetector(geometry, device=device), mesh.nodes.copy()

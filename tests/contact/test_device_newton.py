@@ -55,8 +55,8 @@ def assert_alike(one: NewtonIterate | ReferenceIterate, other: NewtonIterate) ->
 def test_iterates_equal_those_of_the_host(
     creature: Creature, points: np.ndarray, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Initial iterate, full and partial trial steps, further trials, and a new tangent with the muscles' stiffness.
-    Everything runs twice, because a GPU replays graphs the second time."""
+    """Compare the initial iterate, full and partial trial steps, further trials, and a new tangent with the muscles'
+    stiffness, for several problems, because a GPU records graphs in the first and replays them in the others."""
     stepper = on_device(creature, device, monkeypatch)
     respond, factors = stepper.linearizer, stepper.factors
     assert isinstance(respond, DeviceContactLinearizer)
@@ -90,7 +90,7 @@ def test_iterates_equal_those_of_the_host(
 
 
 def test_an_inverted_element_gives_nan(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The previous iterate remains usable."""
+    """A step that inverts an element is reported; the iterate before it remains usable."""
     stepper = on_device(creature, device, monkeypatch)
     respond, (problem, *_) = stepper.linearizer, problems(stepper, creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
@@ -108,8 +108,8 @@ def test_an_inverted_element_gives_nan(creature: Creature, device: str, monkeypa
 
 
 def test_nan_of_an_earlier_step_is_ignored(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step does not depend on NaN that an earlier one left, from a matrix without factors or from a diverged
-    iterate."""
+    """NaN that an earlier step has left in the workspace, from a matrix without factors or a diverged iterate, do not
+    change a step."""
     stepper = on_device(creature, device, monkeypatch)
     respond, (problem, *_) = stepper.linearizer, problems(stepper, creature)
     assert isinstance(respond, DeviceContactLinearizer)
@@ -142,7 +142,7 @@ def test_nan_of_an_earlier_step_is_ignored(creature: Creature, device: str, monk
 
 def test_evicted_data_are_uploaded_again(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The workspace holds two iterates; an evicted one is uploaded again and gives the same step. It holds one
-    linearisation; an older one raises instead of using data of another.
+    linearisation; using an older one raises an error.
     """
     stepper = on_device(creature, device, monkeypatch)
     respond, (problem, *_) = stepper.linearizer, problems(stepper, creature)
@@ -179,7 +179,8 @@ def test_evicted_data_are_uploaded_again(creature: Creature, device: str, monkey
 def test_contacts_do_not_depend_on_the_prefetch(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The prefetch is for the same step, or for one with another state, step size or set of points."""
+    """The selection is correct after a prefetch for the same step, and after one for another state, step size or set of
+    points."""
     stepper = on_device(creature, device, monkeypatch)
     first, second, _ = problems(stepper, creature)
     lifted = BodyState(creature.start.positions + [0.0, 0.0, 0.004], first.state.velocities)
@@ -203,8 +204,8 @@ def test_contacts_do_not_depend_on_the_prefetch(
 def test_a_tangent_whose_sum_is_indefinite_equals_the_host_s(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The muscles' stiffness is not definite by itself: the whole matrix is factored, and the iterate stays the
-    same."""
+    """If the low-rank update by the muscles' stiffness fails, the whole matrix is factored; the iterate is that of the
+    host."""
     stepper = on_device(creature, device, monkeypatch)
     problem, *_ = problems(stepper, creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)

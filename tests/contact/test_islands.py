@@ -1,4 +1,5 @@
-"""Islands: the same partition as a graph search, named by the lowest body, for many worlds and any order."""
+"""Islands: equal to connected components by a graph search, numbered by their lowest body, for many worlds and any
+order of contacts."""
 
 from __future__ import annotations
 

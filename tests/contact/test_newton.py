@@ -35,8 +35,8 @@ def falling(creature: Creature) -> tuple[StepProblem, MuscleEnergy, np.random.Ge
 
 
 def test_a_newton_step_solves_the_linear_equation(creature: Creature) -> None:
-    """Near the solution the residual is linear: after a full or a half step with matching forces it vanishes. The
-    free contact velocities are those of the step without forces.
+    """Near the solution the residual is linear: it vanishes after a full step, and after a half step with half of the
+    forces. The free contact velocities are those of the step without forces.
     """
     problem, tension, random = falling(creature)
     factors, solver = MultifrontalLdl(creature.body.assembly.upper_pattern), creature.stepper.solver
@@ -119,8 +119,8 @@ def test_the_prefetched_step_is_a_newton_step_with_fixed_forces(creature: Creatu
 
 @pytest.mark.parametrize("pulled", [True, False])
 def test_kernels_equal_numpy(creature: Creature, pulled: bool) -> None:
-    """Residual norms, contact velocities, and full and partial Newton steps, also with the muscles' stiffness in the
-    tangent."""
+    """Compare residual norms, contact velocities, and full and partial Newton steps, with and without the muscles'
+    stiffness in the tangent."""
     problem, tension, random = falling(creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(0, 36, 5), problem.state.positions)
     stiff = tension if pulled else None

@@ -1,4 +1,4 @@
-"""One rule judges the Newton steps of a host, of a loop on a GPU and of many worlds (Eq. 4, 8)."""
+"""The convergence rule of Newton steps: the same on the host, in a loop on a GPU and for many worlds (Eq. 4, 8)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def run_loop(
     """Run the loop's kernels on prescribed trials, each world until its loop condition is 0.
 
     Returns:
-        The number of trials of each world, and (B, ROW_SIZE) the progress at the end.
+        The number of trials of each world, and the progress at the end (B, ROW_SIZE).
     """
     rows = np.stack([start.row for start in starts])
     rows[:, kernels.UNIT] = UNIT
@@ -104,7 +104,7 @@ def test_a_loop_makes_the_trials_that_do_not_need_the_host(
 
 
 def test_worlds_are_judged_independently_and_as_on_the_host(device: str) -> None:
-    """Residuals decrease and increase at random; loops start in the middle of a round."""
+    """The residuals increase or decrease at random; the loops start from the progress of an unfinished round."""
     random = np.random.default_rng(0)
     starts, trials = [], []
     for _ in range(100):

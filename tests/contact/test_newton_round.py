@@ -43,8 +43,8 @@ class ScriptedWorlds:
 
 
 def test_each_world_halves_renews_and_ends_by_its_own_outcomes() -> None:
-    """World 0 halves twice, renews its tangent and ends; world 1 fails; world 2 stops for points that penetrate, with a
-    pending tangent; world 3 has no such points, goes on and runs out of steps."""
+    """World 0 halves its step twice, updates its tangent and converges; world 1 fails; world 2 stops because points
+    penetrate, while its tangent update is pending; world 3 has no such points, continues and reaches the step limit."""
     near = ACCEPTED | NEAR_END
     worlds = ScriptedWorlds(
         [

@@ -29,7 +29,7 @@ def level_set(size: tuple[float, float, float]) -> LevelSet:
 
 
 def box(size: tuple[float, float, float], counts: tuple[int, int, int] = (2, 2, 2), spacing: float = 0.1) -> PairBody:
-    """A box on z = 0 with a grid of contact points on its surface."""
+    """Create a box on z = 0 with a grid of contact points on its surface."""
     mesh = box_mesh(counts, size)
     steps = [np.linspace(-s / 2, s / 2, int(np.ceil(s / spacing)) + 1) for s in size[:2]]
     heights = np.linspace(0.0, size[2], int(np.ceil(size[2] / spacing)) + 1)
@@ -55,8 +55,8 @@ SMALL, LARGE = (0.3, 0.3, 0.3), (1.0, 1.0, 0.4)
 
 @pytest.fixture(scope="module")
 def deformed() -> tuple[PairContactDetector, np.ndarray, PairContactSet]:
-    """A small box rotated into the top of a larger one, both with perturbed nodes, and contacts at all of its points
-    that are near the larger one, inside or outside."""
+    """Place a small, rotated box in the top of a larger one, both with perturbed nodes. The contacts are all points of
+    the small box near the surface of the larger one, inside or outside."""
     random = np.random.default_rng(1)
     small, large = box(SMALL), box(LARGE)
     detector = PairContactDetector([small, large], device="cpu")

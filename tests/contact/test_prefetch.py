@@ -28,7 +28,7 @@ WALL = Plane(np.array([-1.0, 0.0, 0.0]), 0.205)
 
 
 def ground(kind: str) -> ContactGeometry:
-    """A block with many points under its base and on its sides, on ``kind`` of ground."""
+    """Create a block with many contact points on its base and its sides, on ground of the given ``kind``."""
     mesh = block_mesh()
     half = mesh.nodes[:, 0].max()
     side = np.linspace(-half, half, 15)
@@ -60,7 +60,7 @@ def test_selected_points_equal_those_of_the_host(kind: str, device: str) -> None
     before, changed, sunk = np.zeros(0, int), 0, 0
 
     def wait() -> None:
-        # The workspaces synchronise with their graph; here nothing else has synchronised with the download.
+        # Usually the workspaces synchronise with their graph; in this test, the download needs its own synchronisation.
         if torch.device(device).type == "cuda":
             torch.cuda.synchronize()
 

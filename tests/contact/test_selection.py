@@ -18,7 +18,7 @@ NEAR = 0.01
 
 @pytest.fixture(scope="module")
 def geometry() -> ContactGeometry:
-    """A block with a fine grid of points under its base and some on its sides."""
+    """Create a block with a fine grid of contact points on its base and some on its sides."""
     mesh = block_mesh()
     half = mesh.nodes[:, 0].max()
     side = np.linspace(-half, half, 15)
@@ -83,8 +83,8 @@ def test_the_number_of_cells_does_not_depend_on_the_ground_height() -> None:
 
 
 def test_rounding_changes_neither_cells_nor_points(geometry: ContactGeometry) -> None:
-    """The last bits of weights and gaps differ between machines. Of points with equal gaps, the one closest to the
-    centre of its cell is selected."""
+    """Rounding errors of weights and gaps, which differ between machines, do not change the selection: of points with
+    equal gaps, the one closest to the centre of its cell is selected."""
     random = np.random.default_rng(0)
     weights = geometry.weights + 1e-15 * random.standard_normal(geometry.weights.shape)
     other = ContactSelector(replace(geometry, weights=weights), activation_distance=NEAR, hysteresis=1e-3)

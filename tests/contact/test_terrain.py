@@ -1,5 +1,5 @@
-"""Terrain: tops of solids and one-line errors of a terrain file; uneven ground: gaps and frames against references,
-and a body that comes to rest on waves.
+"""Terrain of solids: heights of their tops, and one-line errors of a terrain file. Uneven ground: gaps and frames
+against references, and a body that comes to rest on waves.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def test_tops_of_a_step_a_ramp_a_wall_and_a_box() -> None:
 
 
 def test_the_top_of_an_overhang() -> None:
-    """A solid below a level face at z = 1 and below a face z = 2 x: a vertical line through the part with x < 0.5
-    leaves it at z = 1; beyond, it misses the solid."""
+    """The solid is bounded by the faces z = 2 x below and z = 1 above: a vertical line leaves it at z = 1 if x < 0.5,
+    and misses it otherwise."""
     wedge = Solid((Plane.from_coefficients(0.0, 0.0, 1.0, -1.0), Plane.from_coefficients(2.0, 0.0, -1.0, 0.0)))
     for x, z in ((0.0, 0.0), (0.0, -3.0), (0.4, 0.1), (-2.0, -1.0)):
         assert wedge.distance_along(np.array([x, 0.0, z]), UP) == pytest.approx(1.0 - z)
@@ -116,7 +116,7 @@ WALL = Solid((Plane.from_coefficients(-1.0, 0.0, 0.0, 0.15),))
 
 
 def test_the_kernel_equals_its_twin(device: str) -> None:
-    """Eq. (8): gaps to waves and to a wall beside them, the nearer of both, and contact frames, against plain NumPy."""
+    """Eq. (8): gaps to the nearer of wavy ground and a wall beside it, and contact frames, against plain NumPy."""
     mesh = block_mesh()
     field = wavy_ground(reach=0.3)
     cloud = surface_cloud(mesh, 400, lowest=0.04)
@@ -124,7 +124,7 @@ def test_the_kernel_equals_its_twin(device: str) -> None:
     geometry = contact_geometry(cloud, mesh, (FLOOR,), field=field, solids=(wall,), device=device)
     detector = ContactDetector(geometry, device=device)
     random = np.random.default_rng(2)
-    # Half of the points are far beyond the grid.
+    # Half of the points are far outside the grid.
     x = 2.0 * mesh.nodes + 0.2 * random.standard_normal(mesh.nodes.shape) - [0.0, 0.0, 0.3]
     points = np.einsum("pw,pwi->pi", geometry.weights, x[mesh.tets[geometry.tet_from_point]])
     both = np.stack([field.gaps(points), wall.faces[0].heights(points)])
@@ -139,8 +139,8 @@ def test_the_kernel_equals_its_twin(device: str) -> None:
 
 
 def test_contact_velocities_are_the_rate_of_the_gap(device: str) -> None:
-    """For points on the ground: after a small displacement the gap is, to second order, what the frame's normal row
-    predicts."""
+    """For points on the ground, the normal contact velocities predict the gaps after a small displacement to second
+    order."""
     mesh = block_mesh()
     field = wavy_ground()
     x = mesh.nodes.copy()
@@ -233,7 +233,8 @@ def test_the_drop_passes_the_audit() -> None:
 
 
 def test_the_audit_recomputes_the_ground() -> None:
-    """Another ground, or normals that are not those of the ground, are detected."""
+    """The audit detects forces that do not fit a lifted, lowered or shifted ground. It uses the normals of the ground
+    instead of the stored ones."""
     t, _, _ = drop()
     lifted = replace(t, ground_coefficients=t.ground_coefficients + 0.02)
     assert audit(lifted).penetration > 0.015
@@ -241,6 +242,6 @@ def test_the_audit_recomputes_the_ground() -> None:
     assert audit(lowered).complementarity_gap > 1e-4
     moved = replace(t, ground_origin=t.ground_origin + [0.2, 0.0, 0.0])
     assert audit(moved).complementarity_gap > 1e-3 or audit(moved).cone_violation > 1e-3
-    # The stored normals are ignored: forces must obey those of the ground.
+    # The stored normals are ignored: forces are resolved along the normals of the ground.
     upright = replace(t, contact_normal=np.tile([0.0, 0.0, 1.0], (len(t.contact_normal), 1)))
     assert audit(upright).cone_violation == audit(t).cone_violation

@@ -1,6 +1,4 @@
-"""Tests of several modules: contact between bodies in a reference step, against closed forms of collision, rest and
-sliding.
-"""
+"""Contact between two bodies in a reference step, against closed forms of collision, rest and sliding."""
 
 from __future__ import annotations
 

@@ -25,7 +25,8 @@ from tests.support.properties import examples
 
 
 def colours(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return (n, 3) linear colour in the unit ``direction`` (n, 3), as the INRIA renderer evaluates it."""
+    """Return the linear colours (n, 3) of ``sh`` in the unit ``direction`` (n, 3), by the formulas of the INRIA
+    renderer."""
     x, y, z = direction.T
     basis = [
         0.28209479177387814 + 0 * x,
@@ -66,8 +67,8 @@ def test_a_rotated_cage_rotates_shape_and_colour_exactly(device: str, degree: in
 
 
 def test_colour_rotates_exactly_where_euler_angles_are_arbitrary(device: str) -> None:
-    """Eq. (15): the identity, rotations about z alone and by 180 degrees about horizontal axes, and small
-    perturbations of each."""
+    """Eq. (15): colours are exact for the identity, for rotations about z alone and by 180 degrees about horizontal
+    axes, and for small perturbations of each."""
     half = [np.pi * np.array([np.cos(a), np.sin(a), 0.0]) for a in (0.0, 0.5 * np.pi, 1.1)]
     near = np.array([1e-9, -3e-5, 2e-4])
     vectors = np.array(
@@ -107,7 +108,7 @@ def test_rotating_the_object_is_rotating_the_camera(device: str) -> None:
     ]
     difference = np.abs(pictures[0] - pictures[1])
     assert pictures[0].max() - pictures[0].min() > 0.5
-    # A splat that is cut at 1/255 in only one of the images differs by more; this is one in ten thousand.
+    # A pixel differs by more if a splat is cut at 1/255 in only one of the images, which is rare.
     assert np.percentile(difference, 99.9) < 1e-4
     assert difference.max() < 4e-3 * np.abs(pictures[0]).max()
 
@@ -147,7 +148,7 @@ def test_an_affine_cage_deforms_flat_splats_exactly(device: str) -> None:
 
 
 def tets_of(embedding: GaussianEmbedding) -> np.ndarray:
-    """Return (n, 7) tetrahedra of the mean and of the ends of the six arms."""
+    """Return the indices (n, 7) of the tetrahedra of the mean and of the ends of the six arms of each Gaussian."""
     return np.asarray(embedding.points.tets.numpy(), np.int32).reshape(-1, 7)
 
 
@@ -163,8 +164,8 @@ def by_arms(cloud: GaussianCloud, embedding: GaussianEmbedding, positions: np.nd
 
 
 def test_arms_follow_their_ends(device: str) -> None:
-    """Eq. (14): (F+ + F-)/2 from the deformed ends, in float64, gives the deformed covariance, for ends in the same
-    tetrahedron, in the next one and farther, where the cage is bent and perturbed."""
+    """Eq. (14): in a bent and perturbed cage, (F+ + F-)/2 from the deformed ends, in float64, gives the deformed
+    covariance. The ends are in the tetrahedron of the mean, in its neighbours or farther away."""
     mesh, cloud = box((4, 4, 4)), random_cloud(400, degree=0, scale=0.15, device=device)
     rng = np.random.default_rng(2)
     positions = bent(mesh.nodes, 1.0) + 0.02 * rng.normal(size=mesh.nodes.shape)
@@ -174,7 +175,7 @@ def test_arms_follow_their_ends(device: str) -> None:
     sigma = gradient @ covariances(cloud) @ gradient.transpose(0, 2, 1)
     shared = (mesh.tets[tets][:, 1:, :, None] == mesh.tets[tets][:, :1, None, :]).any(axis=3).sum(axis=2)
     assert (shared == 4).any() and (shared == 3).any() and (shared < 3).any()
-    # An arm too short for a difference of float32 positions uses the mean of the two gradients instead.
+    # An arm too short for a difference of float32 positions uses the mean of the two deformation gradients instead.
     exact = (np.linalg.det(gradient) > 0.05) & ~((shared < 3) & (arms < 2e-3)).any(axis=1)
     assert exact.mean() > 0.9
     error = np.abs(covariances(result) - sigma).max(axis=(1, 2)) / np.abs(sigma).max(axis=(1, 2))
@@ -228,7 +229,7 @@ def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
 @pytest.mark.parametrize("along", [0, 1, 2])
 @pytest.mark.parametrize("quarters", [0, 1])
 def test_a_bend_about_any_axis_of_a_needle_is_measured(device: str, along: int, quarters: int) -> None:
-    """Eq. (16): 40 degrees for each choice of the long axis and of the axis of bending."""
+    """Eq. (16): a bend of 40 degrees is measured for each choice of the long axis and of the axis of bending."""
     mesh, radius = box((24, 2, 2), (4.0, 0.4, 0.4)), 1.2 / np.radians(40.0)
     # Axis ``along`` of the Gaussian is parallel to x, and the next one to y, or to z after a quarter turn about x.
     frame = Rotation.from_rotvec([0.5 * np.pi * quarters, 0.0, 0.0]).as_matrix() @ np.roll(np.eye(3), along, axis=1)
@@ -295,8 +296,8 @@ def test_no_spike_and_no_nan_for_any_cage(seed: int, noise: float, flatten: floa
 
 
 def test_the_mean_is_the_mean_of_the_deformed_mass(device: str) -> None:
-    """Eq. (14) and second order: the deformed mean of a long Gaussian is the mean of its deformed mass, estimated by
-    sampling."""
+    """Eq. (14) with the second-order term: the deformed mean of a long Gaussian is the mean of its deformed mass, which
+    is estimated by sampling."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
     scales = np.array([0.3, 0.02, 0.03])
     cloud = GaussianCloud.from_numpy(
@@ -319,7 +320,7 @@ def test_scale_and_rotation_do_not_flicker() -> None:
     """Eq. (15): under a slow twist by 360 degrees with stretch, axes keep their order and move little in every
     frame."""
     mesh, cloud = box(), random_cloud(200, degree=0)
-    # Scales differ by more than the stretch can change; axes of closer scales may swap within one frame.
+    # The ratios of the scales exceed the stretch; axes of more similar scales may swap within one frame.
     scales = np.random.default_rng(1).permuted(np.tile(np.log([0.06, 0.03, 0.01]), (200, 1)), axis=1)
     cloud = GaussianCloud.from_numpy(
         cloud.means.numpy(),
@@ -386,8 +387,8 @@ def turns_of(count: int, seed: int) -> np.ndarray:
 
 
 def test_the_rotation_of_a_singular_map_is_that_of_its_svd(device: str) -> None:
-    """Eq. (15): for F with a singular value that is zero, or nearly, the rotation is that of SciPy's SVD with det = +1,
-    in any order of the other two."""
+    """Eq. (15): if one singular value of F is zero or almost zero, the rotation equals that of SciPy's SVD with det =
+    +1, whatever the order of the other two singular values."""
     stretches = [(1.0, 0.4, 0.0), (1.0, 0.0, 0.4), (0.4, 1.0, 0.0), (0.0, 0.4, 1.0), (0.4, 0.0, 1.0), (0.0, 1.0, 0.4)]
     stretches += [(1.0, 1e-9, 0.3), (0.3, 1.0, -0.05), (-0.05, 0.3, 1.0), (0.9, -0.02, 0.4)]
     for turned in (False, True):
@@ -403,7 +404,7 @@ def test_the_rotation_of_a_singular_map_is_that_of_its_svd(device: str) -> None:
 
 
 def test_the_rotation_of_a_rank_one_map_maps_its_line(device: str) -> None:
-    """F = s u v^T, along each axis and obliquely: the rotation is proper, and R v = u."""
+    """For F = s u v^T with u and v along the axes or oblique, the rotation is proper, and R v = u."""
     slanted = np.random.default_rng(5).normal(size=(6, 2, 3))
     lines = np.concatenate([[(a, b) for a in np.eye(3) for b in np.eye(3)], slanted])
     u, v = np.swapaxes(lines / np.linalg.norm(lines, axis=2, keepdims=True), 0, 1)
@@ -418,7 +419,7 @@ def test_the_rotation_of_a_rank_one_map_maps_its_line(device: str) -> None:
 
 
 def test_axes_keep_their_order(device: str) -> None:
-    """The order of a frame's columns is the best aligned of all six."""
+    """The best aligned of all six orders of a frame's columns is chosen."""
     count = 200
     frames = turns_of(count, 4)
     carried = np.random.default_rng(10).normal(size=(count, 3, 3))
@@ -433,7 +434,7 @@ def test_axes_keep_their_order(device: str) -> None:
 
 
 def test_axes_keep_their_signs(device: str) -> None:
-    """The signs are the closest to the reference of the four choices with det = +1."""
+    """The signs closest to the reference are chosen from the four choices with det = +1."""
     count, random = 200, np.random.default_rng(9)
     frames = turns_of(count, 3)
     orders = np.array([random.permutation(3) for _ in range(count)])

@@ -1,4 +1,4 @@
-"""Eq. (2), (3): points and Gaussians in the rest cage."""
+"""Eq. (2), (3): embedding of points and Gaussians in the rest cage."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from egs_warp.geometry.tetmesh import TetMesh
 
 
 def blob(seed: int = 0, count: int = 60) -> TetMesh:
-    """Return a box with a cut-out, so that it is not convex."""
+    """Return a perturbed box with a cut-out, which is not convex."""
     rng = np.random.default_rng(seed)
     grid = np.stack(np.meshgrid(*[np.linspace(0, 1, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
     nodes = np.concatenate([grid, rng.uniform(0.05, 0.95, (count, 3))])
@@ -27,7 +27,7 @@ def blob(seed: int = 0, count: int = 60) -> TetMesh:
 
 
 def distance_to_triangles(corners: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return (F,) the distance from p to triangles (F, 3, 3), by the plane and the three edges."""
+    """Return the distances (F,) from p (3,) to triangles ``corners`` (F, 3, 3), by their planes and edges."""
     edges = np.roll(corners, -1, axis=1) - corners
     normal = np.cross(edges[:, 0], edges[:, 1])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -40,7 +40,11 @@ def distance_to_triangles(corners: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def brute_force(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Test all tetrahedra for every point: weights (P, T, 4), smallest weight (P, T), distance (P, T)."""
+    """Test all T tetrahedra for each of P points.
+
+    Returns:
+        Barycentric weights (P, T, 4), their minima (P, T) and the distances (P, T).
+    """
     x = mesh.nodes[mesh.tets]
     system = np.concatenate([x.transpose(0, 2, 1), np.ones((len(x), 1, 4))], axis=1)
     right = np.concatenate([points, np.ones((len(points), 1))], axis=1)

@@ -97,7 +97,7 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
     result = split_for_motion(cloud, embedding, frames, max_growth=20.0)
     after = Deformer(result.cloud, result.embedding).measure_bend(frames)
     visible = result.cloud.opacities() > 0.01
-    # Ends of tilted needles stick out of the bar, where the fit error is that of the extrapolation.
+    # Ends of tilted needles are outside the bar, where the fit error is that of the extrapolation.
     within, before_within = (e.points.inside.numpy().reshape(-1, 7).all(axis=1) for e in (result.embedding, embedding))
     assert within.mean() > 0.5
     assert after.fit_error[visible & within].max() < 0.6 * before.fit_error[before_within].max()
@@ -108,8 +108,8 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
 
 
 def test_a_count_limit_splits_those_with_the_largest_fit_error() -> None:
-    """With a limit on the count, the Gaussians with the largest fit error are split, all of which would be split
-    without a limit too."""
+    """With a limit on the count, the Gaussians with the largest fit errors are split; without the limit, they would be
+    split, too."""
     mesh, cloud = box((24, 2, 2), (4.0, 0.4, 0.4)), bar_cloud()
     embedding = embed_gaussians(cloud, mesh)
     bend = Deformer(cloud, embedding).measure_bend([bent(mesh.nodes, 1.5)])
@@ -126,7 +126,7 @@ def test_a_count_limit_splits_those_with_the_largest_fit_error() -> None:
 
 
 def test_gaussians_at_the_depth_limit_are_not_split() -> None:
-    """A Gaussian at the depth limit is not split, however bent; others are split once more, and their depth
+    """A Gaussian at the depth limit is not split, whatever its bend; all others are split once more, and their depth
     increases."""
     mesh, cloud = box((24, 2, 2), (4.0, 0.4, 0.4)), bar_cloud()
     embedding = embed_gaussians(cloud, mesh)
@@ -167,7 +167,7 @@ def test_an_animation_with_splits_has_no_pops() -> None:
             render_gaussians(Deformer(*each).deform(nodes).cloud, camera).colour.numpy()
             for each, nodes in zip(clouds, frames, strict=True)
         ]
-        # Subtract the change of a uniform motion between two frames: compensation to first order.
+        # The second difference in time is zero for a uniform change.
         change = np.stack([a - 2.0 * b + c for a, b, c in zip(pictures, pictures[1:], pictures[2:], strict=False)])
         return np.sqrt((change**2).mean(axis=(1, 2, 3)))
 
@@ -218,6 +218,6 @@ def test_child_opacities_follow_the_split_rules() -> None:
     np.testing.assert_array_equal(outer, other)
     assert outer[0] == middle[0] == 0.0 and (np.diff(outer) > 0.0).all() and (np.diff(middle) > 0.0).all()
     assert (outer[1:] < middle[1:]).all() and (middle[1:] < opacities[1:]).all()
-    # Along the middle axis faint children add up to the parent: 2 outer exp(-1) + middle, to 3 %.
+    # At the parent's centre, faint children add up to the parent to 3.5 %: 2 outer exp(-1) + middle.
     faint = slice(1, 9)
     np.testing.assert_allclose(2.0 * outer[faint] * np.exp(-1.0) + middle[faint], opacities[faint], rtol=0.035)

@@ -1,5 +1,5 @@
-"""Props of one tetrahedron: moments of a box, exact energies of affine motions, and flight, sag, tipping and sliding
-in today's step against closed forms.
+"""Affine bodies of one tetrahedron: moments of a box, energies of affine motions, and flight, sag, tipping and sliding
+against closed forms.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ DT = 1 / 240
 
 
 def box_prop(size: tuple[float, float, float], slope: float = 0.0, *, sag: float = 1e-5) -> SoftBody:
-    """A box on z = 0 whose gravity is tilted towards +x by ``slope`` radians."""
+    """Create a box on z = 0 under gravity that is tilted towards +x by ``slope`` radians."""
     moments = VolumeMoments.of_mesh(box_mesh((1, 1, 1), size))
     return affine_body(moments, size[2], up=np.array([-np.sin(slope), 0.0, np.cos(slope)]), sag=sag, device="cpu")
 
@@ -40,7 +40,7 @@ def on_floor(body: SoftBody, size: tuple[float, float, float], friction: float) 
 def test_moments_of_a_box_are_the_same_from_mesh_surface_and_solid() -> None:
     size = np.array([0.4, 0.2, 0.9])
     mesh = box_mesh((2, 1, 3), tuple(size))
-    # The cubes of the lattice fill the box: 20 x 10 columns, and 44 layers above a half one.
+    # The cubes of the lattice fill a box of 20 x 10 columns; the lowest of the 45 layers has half the height.
     spacing = 0.02
     solid = LatticeSolid(
         np.ones((20, 10, 45), bool), np.array([-10, -5, 0]), spacing, 0.9, np.zeros(0, bool), np.zeros(0, bool), 0

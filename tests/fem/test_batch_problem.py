@@ -34,7 +34,7 @@ def muscles(body: SoftBody) -> MuscleSet:
 
 @pytest.fixture(scope="module")
 def activations(muscles: MuscleSet) -> np.ndarray:
-    """(3, M) m, contractions and a few extensions, some of them negligible."""
+    """Return activations (3, M), m: contractions and a few extensions, some of them negligible."""
     share = np.random.default_rng(5).uniform(-0.05, 0.3, (3, muscles.segment_count))
     share[:, ::7] *= 1e-5
     return share * muscles.bounds
@@ -52,7 +52,7 @@ def alone(body: SoftBody, states: list[BodyState]) -> list[StepProblem]:
 
 @pytest.fixture(scope="module")
 def beside(body: SoftBody, muscles: MuscleSet, states: list[BodyState]) -> BatchProblem:
-    """The same worlds in slots 0, 1 and 3 of four."""
+    """Create the batch of the same three worlds in slots 0, 1 and 3 of four."""
     return problem_of(BatchBody(body, muscles, 4, panel=32), states)
 
 
@@ -64,7 +64,7 @@ def problem_of(common: BatchBody, states: list[BodyState], *, dt: float = DT, dr
 
 
 def tried(states: list[BodyState]) -> np.ndarray:
-    """(3, N, 3) m/s."""
+    """Return trial velocities (3, N, 3), m/s."""
     random = np.random.default_rng(2)
     return np.stack([state.velocities + 0.1 * random.standard_normal(state.velocities.shape) for state in states])
 
@@ -140,8 +140,8 @@ def test_tangents(
     pulling: bool,
     chunk_bytes: int,
 ) -> None:
-    """Velocity changes by impulses equal those of single worlds, with and without the stiffness of muscles; a given
-    momentum projection is reused."""
+    """Velocity changes by impulses equal those of single worlds, with and without the stiffness of muscles. A momentum
+    projection that is passed in is reused."""
     beside = problem_of(BatchBody(body, muscles, 4, panel=32, chunk_bytes=chunk_bytes), states)
     given, impulses = tried(states), np.random.default_rng(3).standard_normal((3, given_size(body), 4))
     pulls = [MuscleEnergy.of(muscles, one) for one in activations] if pulling else [None] * 3
@@ -158,8 +158,8 @@ def test_tangents(
 def test_tangents_of_muscles_that_are_half_slack(
     body: SoftBody, muscles: MuscleSet, activations: np.ndarray, states: list[BodyState], alone: list[StepProblem]
 ) -> None:
-    """At relative lengths from 0.35 to 0.65 the tension depends on the length: results are those of single worlds, and
-    differ from those without muscles."""
+    """At lengths from 0.35 to 0.65 of the rest length, the tension depends on the length. Velocity changes equal those
+    of single worlds and differ from the ones without muscles."""
     half = replace(muscles, rest_lengths=muscles.rest_lengths / np.linspace(0.35, 0.65, muscles.segment_count))
     beside, given, pulls = problem_of(BatchBody(body, half, 4), states), tried(states), np.abs(activations)
     assert beside.factor(torch.from_numpy(given), torch.from_numpy(half.stiffness * pulls)).all()

@@ -26,7 +26,7 @@ def make_record(count: int = 4) -> Outer:
 
 
 def test_some_worlds_of_a_record() -> None:
-    """In the given order, also in nested records; fields without a world axis are unchanged."""
+    """A subset has the worlds in the given order, also in nested records; fields without a world axis are unchanged."""
     record = make_record()
     some = record.gather(torch.tensor([3, 1]))
     assert some.inner.size.tolist() == [3, 1] and some.name == "all"

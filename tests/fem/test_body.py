@@ -1,6 +1,4 @@
-"""The soft body: mass, momenta, energy, best-fit rotation,
-and the elasticity and damping that follow from its height.
-"""
+"""The soft body: mass, momenta, energy, best-fit rotation, and elasticity and damping from its height."""
 
 from __future__ import annotations
 
@@ -68,7 +66,7 @@ def test_momenta_of_a_rigid_motion(body: SoftBody) -> None:
 
 
 def test_best_fit_rotation_recovers_a_rotation(body: SoftBody) -> None:
-    """Exact for a rotated stretch along the principal axes; a proper rotation even for a mirrored body."""
+    """The rotation is exact for a rotated stretch along the principal axes, and proper even for a mirrored body."""
     turn = Rotation.from_rotvec([0.4, -1.9, 0.8]).as_matrix()
     centred = body.mesh.nodes - body.centre_of_mass(body.mesh.nodes)
     assert np.allclose(body.best_fit_rotation(centred @ turn.T + [1.0, 2.0, 3.0]), turn, atol=1e-12)

@@ -1,4 +1,4 @@
-"""A captured graph repeats its operations with the current contents of its memory."""
+"""CUDA graphs: replays use the current contents of the memory, loops, the cache, stream contexts and forks."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def test_captured_work_reads_the_current_input(device: str) -> None:
             stream.wait()
         expected = np.array([1.0, number, 2.0, 0.0]) * (5.0 + number**2)
         np.testing.assert_array_equal(readback.numpy(), expected)
-    # On a GPU it runs once directly and once for the capture.
+    # On a GPU, the work runs once directly and once for the capture.
     assert len(runs) == (5 if device == "cpu" else 2)
 
 
 @pytest.mark.parametrize("loops", [True, False])
 def test_repeated_work_runs_while_its_flag_is_set(device: str, monkeypatch: pytest.MonkeyPatch, loops: bool) -> None:
-    """With new input each time, and zero repetitions if the flag is 0 at the start; with and without support for
-    conditional graphs."""
+    """The work repeats while its flag is nonzero, and never if it is 0 at the start; each loop reads new input. This
+    holds with and without support for conditional graphs."""
     if not loops:
         monkeypatch.setattr(wp, "is_conditional_graph_supported", lambda: False)
     stream = GraphStream(torch.device(device))
@@ -67,12 +67,12 @@ def test_repeated_work_runs_while_its_flag_is_set(device: str, monkeypatch: pyte
             readback.copy_(sums, non_blocking=True)
             stream.wait()
         np.testing.assert_array_equal(readback.numpy(), [steps, steps * (number + 0.5)])
-    # On a GPU it runs directly three times, in the first loop with work, and once for the capture.
+    # On a GPU, the work runs directly in the three repetitions of the first loop, and once for the capture.
     assert len(runs) == (11 if device == "cpu" else 4)
 
 
 def test_the_cache_keeps_the_most_recent_graphs(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """More keys than the capacity, repeatedly; evicted operations run directly again, with the current arguments."""
+    """With more keys than the capacity, evicted operations run directly again, with the current arguments."""
     monkeypatch.setattr(cuda_graphs, "_MAX_GRAPHS", 3)
     stream = GraphStream(torch.device(device))
     upload, readback = PinnedUpload(stream, 1), stream.pinned(1)
@@ -97,7 +97,7 @@ def test_the_cache_keeps_the_most_recent_graphs(device: str, monkeypatch: pytest
 
 
 def test_garbage_collection_is_disabled_during_a_capture(device: str) -> None:
-    """Freed device memory would synchronize with the device."""
+    """Freeing device memory would synchronise with the device and break the capture."""
     stream, enabled = GraphStream(torch.device(device)), []
     again = stream.run_captured(lambda: enabled.append(gc.isenabled()))
     for _ in range(3):
@@ -107,7 +107,8 @@ def test_garbage_collection_is_disabled_during_a_capture(device: str) -> None:
 
 
 def test_nested_entries_of_a_stream_end_with_the_first(device: str) -> None:
-    """Also with another object for the same stream, and per thread; gradients are enabled before and after."""
+    """Nested entries, also with another object for the same stream, stay in the context of the first. The context is
+    per thread. Gradients are disabled within, and enabled before and after."""
     one, other = GraphStream(torch.device(device)), GraphStream(torch.device(device))
     outside = torch.cuda.current_stream() if device != "cpu" else None
     with one:
@@ -124,8 +125,8 @@ def test_nested_entries_of_a_stream_end_with_the_first(device: str) -> None:
 
 
 def test_later_work_follows_all_branches_of_a_fork(device: str) -> None:
-    """Branches also start after the work before them, run directly and captured: sums of long rows that were just
-    filled."""
+    """Branches start after the work before the fork, run directly and captured. They compute the sums of long rows that
+    this work fills."""
     stream, count = GraphStream(torch.device(device)), 1 << 20
     upload, rows = PinnedUpload(stream, 1), torch.zeros((4, count), dtype=torch.float64, device=device)
     sums, readback = torch.zeros(4, dtype=torch.float64, device=device), stream.pinned(1)

@@ -10,7 +10,7 @@ from egs_warp.fem.dissection import Dissection
 
 
 def upper_of(joined: np.ndarray) -> sparse.csc_matrix:
-    """Upper triangle, with the diagonal, of a pattern (n, n)."""
+    """Return the upper triangle, with the diagonal, of a pattern (n, n)."""
     return sparse.csc_matrix(np.triu(joined | joined.T | np.eye(len(joined), dtype=bool)).astype(float))
 
 
@@ -30,7 +30,7 @@ def test_nothing_joins_two_slabs(count: int, seed: int) -> None:
     for number, part in enumerate(slabs.parts):
         for other in slabs.parts[number + 1 :]:
             assert not joined[np.ix_(part, other)].any()
-    # The smallest possible size is a quarter per part, and three separators as wide as the band.
+    # The optimum is a quarter of the unknowns per part, and three separators as wide as the band.
     assert max(map(len, slabs.parts)) + len(slabs.separator) < 0.3 * count + 12
 
 

@@ -74,7 +74,8 @@ def test_hessian_is_derivative_of_gradient(bent: Bent, damped: bool) -> None:
 
 
 def test_projected_hessian_clamps_each_element(device: str) -> None:
-    """The analytic projection equals clamping the eigenvalues of the element's 9x9 (here 12x12) Hessian numerically."""
+    """The analytic projection equals the Hessian with its negative eigenvalues set to zero numerically, in the
+    coordinates of the deformation gradient."""
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     assembly = ElasticAssembly(TetMesh.oriented(corners, np.array([[0, 1, 2, 3]])), MATERIAL, device=device)
     weights = np.linalg.cholesky(assembly_gram(corners)).T
@@ -82,7 +83,7 @@ def test_projected_hessian_clamps_each_element(device: str) -> None:
     indefinite = 0
     maps = [np.diag(rng.uniform(0.3, 1.6, 3)) + 0.3 * rng.standard_normal((3, 3)) for _ in range(20)]
     for i, k in ((0, 1), (1, 2), (2, 0)):
-        # Shear in a single plane; expansion, strongest along all axes but one.
+        # Shear in one plane; expansion to about three times the size along all axes but one.
         sheared, blown = np.diag([0.5, 0.7, 0.6]), np.diag([3.0, 2.6, 2.8])
         sheared[i, k], blown[k, k] = 0.4, 1.1
         maps += [sheared, blown, blown + 0.1 * rng.standard_normal((3, 3))]
@@ -92,7 +93,7 @@ def test_projected_hessian_clamps_each_element(device: str) -> None:
             continue
         true = full(assembly, assembly.hessian_entries(x))
         projected = full(assembly, assembly.hessian_entries(x, projected=True))
-        # The projection is done in deformation-gradient space: transform both Hessians to it.
+        # The projection acts on deformation gradients: transform both 12 x 12 Hessians to gradient and mean position.
         pull = np.kron(np.linalg.pinv(weights), np.eye(3))
         values, vectors = np.linalg.eigh(pull.T @ true @ pull)
         indefinite += values.min() < -1e-6 * values.max()
@@ -102,7 +103,8 @@ def test_projected_hessian_clamps_each_element(device: str) -> None:
 
 
 def assembly_gram(corners: np.ndarray) -> np.ndarray:
-    """Return the 4x4 matrix whose Cholesky factor maps corner values to gradients (3 rows) and their mean (1 row)."""
+    """Return the 4 x 4 Gram matrix G of a tetrahedron: for corner values u (4,), u^T G u is the squared norm of their
+    gradient plus the square of their mean."""
     inverse = np.linalg.inv((corners[1:] - corners[0]).T)
     gradients = np.vstack([-inverse.sum(0), inverse])
     return gradients @ gradients.T + np.full((4, 4), 1.0 / 16.0)
@@ -153,7 +155,7 @@ def test_pattern_is_the_meshs(device: str) -> None:
 
 
 def test_moduli_of_a_material() -> None:
-    """Lame's parameters: E = mu (3 lambda + 2 mu) / (lambda + mu), nu = lambda / (2 (lambda + mu))."""
+    """Lame's parameters satisfy E = mu (3 lambda + 2 mu) / (lambda + mu) and nu = lambda / (2 (lambda + mu))."""
     for nu in (0.1, 0.25, 0.45):
         material = Material(young_modulus=3.0, poisson_ratio=nu, density=1.0, damping_time=0.0)
         mu, lam = material.mu, material.lam

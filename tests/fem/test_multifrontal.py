@@ -1,4 +1,4 @@
-"""Sparse factors agree with dense algebra and report definiteness by the inertia."""
+"""Sparse factors: solutions agree with dense algebra, and definiteness follows from the inertia of the matrix."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ def test_singular_matrices_are_reported() -> None:
 
 @pytest.mark.parametrize("name", PATTERNS)
 def test_every_pattern_and_number_of_right_sides(name: str) -> None:
-    """The solution is exact to rounding for any memory order; its bits do not depend on the number of right-hand sides,
-    except for a single one."""
+    """The solution is exact to rounding for any memory order. Its bits do not depend on the number of right-hand sides,
+    except that a single one is solved by another routine."""
     matrix = PATTERNS[name]
     factors, count = MultifrontalLdl(upper_of(matrix)), len(matrix.indptr) - 1
     assert is_definite(factors, upper_of(matrix).data) and factors.negative_pivots == 0
@@ -71,7 +71,7 @@ def test_every_pattern_and_number_of_right_sides(name: str) -> None:
 
 
 def strained(factors: LinearSolver, upper: sparse.csc_matrix, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the quadratic model of random input with the factored matrix's pattern."""
+    """Return ``quadratic_form`` for random input and ``vectors``; the random matrix has the pattern of ``upper``."""
     random = np.random.default_rng(6)
     slope, weights, away = random.standard_normal((3, len(vectors)))
     return factors.quadratic_form(upper.data, slope, weights, vectors, dt_now=0.3, dt_ahead=-0.7, reference=away)
@@ -153,7 +153,8 @@ def test_solvers_with_a_shared_analysis_have_their_own_factors() -> None:
 
 
 def test_a_negligible_pivot_has_no_factors() -> None:
-    """The pivot is in the middle or at the start of a block; an indefinite matrix has factors."""
+    """A matrix with a negligible pivot, at the start or in the middle of a block, has no factors; an indefinite matrix
+    has."""
     matrix = PATTERNS["full, of fifty"].toarray()
     whole = upper_of(sparse.csc_matrix(matrix))
     factors = MultifrontalLdl(whole)
@@ -178,7 +179,8 @@ def test_a_negligible_pivot_has_no_factors() -> None:
 
 @pytest.mark.parametrize("size", [2, 7, 60])
 def test_an_inverse_has_the_count_of_positive_eigenvalues(size: int) -> None:
-    """For any symmetric matrix, also with a zero diagonal and 2 x 2 pivots; the upper triangle is not read."""
+    """The inverse of any symmetric matrix is returned with its number of positive eigenvalues, also for zero diagonals
+    and 2 x 2 pivots. The upper triangle is not read."""
     random = np.random.default_rng(size)
     for diagonal in (0.0, 1.0, 10.0, -10.0):
         lower = np.tril(random.normal(size=(size, size)), -1)

@@ -1,4 +1,4 @@
-"""Cholesky factors of many matrices by panels, against NumPy's solutions."""
+"""Cholesky factorisation of many matrices by panels: solutions against NumPy's."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ COUNT, SIZE = 5, 53
 
 @pytest.fixture
 def matrices() -> np.ndarray:
-    """(5, 53, 53), the third indefinite, the fourth with a NaN."""
+    """Return five symmetric matrices (5, 53, 53); the third is indefinite, the fourth has a NaN."""
     half = np.random.default_rng(0).normal(size=(COUNT, SIZE, SIZE))
     made = half @ np.swapaxes(half, 1, 2) + SIZE * np.eye(SIZE)
     made[2] -= 1.01 * np.linalg.eigvalsh(made[2])[0] * np.eye(SIZE)
@@ -25,7 +25,7 @@ def matrices() -> np.ndarray:
 @pytest.mark.parametrize("panel", [8, 53, 96])
 @pytest.mark.parametrize("chunk_bytes", [1, 2**31])
 def test_solutions_equal_those_of_numpy(matrices: np.ndarray, panel: int, chunk_bytes: int) -> None:
-    """In all slots, in some of them, and after some slots were overwritten."""
+    """Compare the solutions in all slots, in a subset of them, and after one slot was overwritten."""
     right = np.random.default_rng(1).normal(size=(COUNT, SIZE, 3))
     upper = sparse.csc_array(np.triu(np.ones((SIZE, SIZE))))
     factors = PanelCholesky(upper, COUNT, torch.device("cpu"), panel=panel, chunk_bytes=chunk_bytes)
@@ -39,7 +39,7 @@ def test_solutions_equal_those_of_numpy(matrices: np.ndarray, panel: int, chunk_
         made = factors.solve(torch.from_numpy(right)[worlds], worlds).numpy()
         at = [worlds.tolist().index(world) for world in fine]
         np.testing.assert_allclose(made[at], np.linalg.solve(matrices[fine], right[fine]), rtol=0, atol=1e-13)
-    # Twice the first matrix, as the sum of it, a diagonal and a term.
+    # Overwrite slot 2 by twice the first matrix, given as entries, a diagonal and a term.
     half = torch.from_numpy(np.tril(matrices[:1]))
     diagonal = half[0].diagonal()
 

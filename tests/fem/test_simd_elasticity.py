@@ -26,7 +26,7 @@ def both(mesh: TetMesh) -> Pair:
 
 
 def part(count: int) -> TetMesh:
-    """Return the first tetrahedra of a block with permuted nodes; the last group of four is incomplete."""
+    """Return the first ``count`` tetrahedra of a block with permuted nodes."""
     mesh = block_mesh()
     used, corners = np.unique(mesh.tets[:count], return_inverse=True)
     order = np.random.default_rng(count).permutation(len(used))
@@ -36,7 +36,8 @@ def part(count: int) -> TetMesh:
 
 
 def strings(mesh: TetMesh) -> MuscleEnergy:
-    """Three segments between a few nodes each; one is slack, one is below the full-force length."""
+    """Return three muscle segments that each depend on many nodes; one is slack, one is shorter than its full-force
+    length."""
     rng = np.random.default_rng(2)
     rows = sparse.csr_matrix(rng.standard_normal((3, len(mesh.nodes))) * (rng.random((3, len(mesh.nodes))) < 0.6))
     lengths = np.linalg.norm(rows @ mesh.nodes, axis=1)
@@ -46,7 +47,7 @@ def strings(mesh: TetMesh) -> MuscleEnergy:
 @pytest.mark.parametrize("count", [1, 4, 7, 40, None])
 @pytest.mark.parametrize("dt", [None, 1 / 60])
 def test_groups_of_four_equal_single_elements(count: int | None, dt: float | None) -> None:
-    """Eq. (5): energy, determinants, gradients with muscles and without, both Hessians."""
+    """Eq. (5): energies, determinants, gradients with and without muscles, and both Hessians agree."""
     mesh = block_mesh() if count is None else part(count)
     one, four = both(mesh)
     rng = np.random.default_rng(3)
@@ -74,7 +75,8 @@ def test_groups_of_four_equal_single_elements(count: int | None, dt: float | Non
 
 
 def test_shapes_with_equal_principal_stretches() -> None:
-    """At rest, stretched along one axis, and scaled uniformly: principal stretches are equal and determine no axes."""
+    """Bodies at rest, stretched along one axis, or scaled uniformly have equal principal stretches, for which the
+    principal axes are not unique; results are finite and agree."""
     mesh = block_mesh()
     one, four = both(mesh)
     for shape in (np.ones(3), np.array([1.0, 1.0, 1.3]), 0.8 * np.ones(3)):

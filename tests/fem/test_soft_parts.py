@@ -1,4 +1,4 @@
-"""Softer parts: their frequency, the sag from which it follows, and the energy of the audit."""
+"""Softer parts of a body: their frequency, the relation between frequency and sag, and the energy in the audit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.meshes import UP, box_mesh, figure
 
 @pytest.fixture(scope="module")
 def body() -> SoftBody:
-    """A figure with two extended arms."""
+    """Create a figure with two extended arms."""
     return make_body(figure(), GROUND)
 
 
@@ -57,7 +57,7 @@ def test_the_stiffness_has_a_minimum(body: SoftBody) -> None:
 
 
 def test_a_beam_with_the_frequency_of_its_sag_sags_as_much() -> None:
-    """Linear statics of a slender horizontal cantilever."""
+    """The sag of a slender horizontal cantilever is computed by linear statics."""
     mesh = box_mesh((20, 2, 2), (2.0, 0.2, 0.2))
     body = make_body(mesh, GROUND)
     free = mesh.nodes[:, 0] > -0.99

@@ -1,5 +1,5 @@
-"""The equation of a step (Eq. 4, 6): its residual is the derivative of an energy, its tangent is the derivative of the
-residual, both momenta are conserved; free fall, spin, drag, and a column that sags.
+"""The equation of a step (Eq. 4, 6). Its residual is the derivative of an energy, its tangent is the derivative of the
+residual, and linear and angular momentum are conserved. Closed forms of free fall, spin, drag and a sagging column.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def tension(body: SoftBody) -> MuscleEnergy:
 
 @pytest.mark.parametrize("muscles", [False, True])
 def test_the_residual_is_the_derivative_of_an_energy_up_to_a_rotation(device: str, muscles: bool) -> None:
-    """Eq. (4), Eq. (6): central differences of Phi(v), with drag and Rayleigh damping; the difference is M times
-    the rigid rotation of the momentum correction, to rounding.
+    """Eq. (4), Eq. (6): the residual equals the gradient of Phi(v), by central differences, minus M times the rigid
+    rotation of the momentum correction, with drag and Rayleigh damping.
     """
     body = make_body(block_mesh(), FLOOR, device=device)
     problem = StepProblem(body, bent_state(body), DT, drag=0.7)
@@ -103,8 +103,8 @@ def test_every_column_has_the_momenta_of_its_impulse(body: SoftBody, tension: Mu
 def test_an_indefinite_stiffness_is_projected_and_keeps_the_momenta(
     body: SoftBody, tension: MuscleEnergy, muscles: bool
 ) -> None:
-    """Compressed to 40 % in a long step, the true S has negative pivots, also with muscles; its definite approximation
-    conserves the momenta, too."""
+    """For a body compressed to 40 % in a long step, the exact matrix has negative pivots, with and without muscles. Its
+    definite approximation conserves the momenta, too."""
     squashed = BodyState(body.mesh.nodes * [1.1, 1.1, 0.4], np.zeros_like(body.mesh.nodes))
     problem, factors = StepProblem(body, squashed, 1.0), MultifrontalLdl(body.assembly.upper_pattern)
     entries = body.assembly.hessian_entries(squashed.positions, problem.damping, factor=1.0)
@@ -117,8 +117,8 @@ def test_an_indefinite_stiffness_is_projected_and_keeps_the_momenta(
 
 
 def test_only_queued_factors_without_a_result_are_replaced() -> None:
-    """A tangent whose factors exist, or are ready, is used as it is; else those of a positive definite approximation at
-    the same velocities take their place."""
+    """A tangent is used as it is if no factors are queued for it, or if they turn out to be definite. Otherwise a
+    positive definite approximation at the same velocities is factored."""
     near: list[np.ndarray] = []
     problem: Any = SimpleNamespace(factor_near=lambda factors, velocities: near.append(velocities))
     velocities = np.zeros((4, 3))
@@ -130,8 +130,8 @@ def test_only_queued_factors_without_a_result_are_replaced() -> None:
 
 @pytest.mark.parametrize("inverting", [False, True])
 def test_a_compressed_body_and_an_inverting_start_are_solved(body: SoftBody, inverting: bool) -> None:
-    """For a body compressed to 55 %, at rest or so fast that its velocities would invert elements, the step ends with a
-    balanced equation and J > 0.
+    """For a body compressed to 55 %, at rest or with velocities that would invert elements, the step ends with a small
+    residual and J > 0.
     """
     squashed = body.mesh.nodes * [1.1, 1.1, 0.55]
     fast = -2.0 * squashed / DT * [0, 0, 1]
@@ -143,7 +143,7 @@ def test_a_compressed_body_and_an_inverting_start_are_solved(body: SoftBody, inv
 
 
 def test_a_step_reports_that_it_does_not_converge(body: SoftBody) -> None:
-    """No floating-point residual reaches the tolerance."""
+    """The tolerance of 1e-25 is below rounding errors, so no step reaches it."""
     _, result = passive_body(body, state=bent_state(body), tolerance=1e-25).advance(DT)
     assert not result.converged
     assert 1e-25 < result.residual < 1e-9
@@ -166,8 +166,8 @@ def fall(
 
 @pytest.mark.parametrize("muscles", [False, True])
 def test_free_fall_follows_the_discrete_parabola(body: SoftBody, tension: MuscleEnergy, muscles: bool) -> None:
-    """Eq. (4): in flight the centre of mass is x0 + n dt v0 + g dt^2 n (n + 1) / 2, to 1e-6 H, for any deformation; L
-    is conserved to rounding, where implicit Euler alone loses spin.
+    """Eq. (4): in flight the centre of mass is at x0 + n dt v0 + g dt^2 n (n + 1) / 2, to 1e-6 H, for any deformation.
+    The angular momentum is conserved to rounding, while implicit Euler alone loses spin.
     """
     start = spinning_state(body) if muscles else bent_state(body)
     states, given_back = fall(body, start, DT, 30, tension if muscles else None)
@@ -179,7 +179,7 @@ def test_free_fall_follows_the_discrete_parabola(body: SoftBody, tension: Muscle
     spins = np.array([body.angular_momentum(s.positions, s.velocities) for s in states])
     assert np.abs(spins - spins[0]).max() < 1e-10 * np.abs(spins[0]).max()
     assert given_back > 1e-3
-    # The body must deform, or the test would show nothing.
+    # The body deforms, so that the test is not trivial.
     assert np.ptp([body.assembly.energy(s.positions) for s in states]) > 1e-3
 
 
@@ -198,8 +198,8 @@ def test_free_fall_converges_at_rate_one(body: SoftBody) -> None:
 
 @pytest.mark.parametrize("damping_ratio", [0.0, 0.05])
 def test_spin_survives_a_free_half_turn(damping_ratio: float) -> None:
-    """A free half turn in 24 steps conserves L to rounding and rotates by 180 degrees within 3; implicit Euler alone
-    would lose 10 % of the spin.
+    """A free half turn in 24 steps conserves the angular momentum to rounding, and the rotation is 180 degrees to
+    within 3 degrees; implicit Euler alone would lose 10 % of the spin.
 
     With and without damping, because Eq. (6) does not damp rotations. The body is stiff, since a soft one expands under
     the spin and therefore rotates more slowly.
@@ -218,8 +218,8 @@ def test_spin_survives_a_free_half_turn(damping_ratio: float) -> None:
 
 
 def test_damping_resists_deformation_but_no_rigid_motion(body: SoftBody) -> None:
-    """Eq. (6): no rigid motion of a deformed body causes a damping force, however large; other motions lose the power
-    -v.f >= 0.
+    """Eq. (6): a rigid motion of a deformed body, however large, causes no damping force; other motions dissipate the
+    power -v.f >= 0.
     """
     problem = StepProblem(body, bent_state(body), DT)
     assembly, start = body.assembly, problem.state.positions
@@ -239,8 +239,8 @@ def test_damping_resists_deformation_but_no_rigid_motion(body: SoftBody) -> None
 
 
 def test_drag_slows_free_flight_exponentially(body: SoftBody) -> None:
-    """Eq. (6): in each implicit step, drag alpha changes v_com to (v_com + g dt) / (1 + alpha dt), and L likewise
-    without the gravity term.
+    """Eq. (6): in each implicit step, drag alpha changes the velocity v of the centre of mass to (v + g dt) / (1 +
+    alpha dt), and the angular momentum L to L / (1 + alpha dt).
     """
     alpha, start = 2.0, spinning_state(body)
     states, _ = fall(body, start, DT, 3, drag=alpha)

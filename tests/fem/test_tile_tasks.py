@@ -1,4 +1,4 @@
-"""The tasks, executed in sequence, compute the inverse of a factor."""
+"""Tile tasks: executed in sequence, they compute the inverse of a Cholesky factor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Dense and sparse factors give the same solutions and the same verdicts on definiteness."""
+"""Dense and sparse factors give the same solutions and agree on which matrices are definite."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ SIZES = [
     ([200, 190, 210, 150], 129),
     ([1, 504, 426, 468], 305),
 ]
-"""Unknowns of the slabs and of the separator."""
+"""Numbers of unknowns of the slabs, and number of unknowns of the separator."""
 
 
 def entries_of(upper: sparse.csc_matrix, seed: int, diagonal: float) -> np.ndarray:
-    """(nnz,) of a random symmetric matrix with the pattern of ``upper``."""
+    """Return the entries (nnz,) of a random symmetric matrix with the pattern of ``upper``."""
     entries = np.random.default_rng(seed).normal(size=upper.nnz)
     entries[upper.indptr[1:] - 1] += diagonal
     return entries
 
 
 def pattern(count: int) -> sparse.csc_matrix:
-    """Upper triangle, a tenth of it filled, with the diagonal."""
+    """Return a random pattern of an upper triangle with the diagonal and a tenth of the other entries."""
     filled = np.triu(np.random.default_rng(3).random((count, count)) < 0.1) | np.eye(count, dtype=bool)
     upper = sparse.csc_matrix(filled.astype(float))
     upper.sort_indices()
@@ -52,14 +52,14 @@ def pattern(count: int) -> sparse.csc_matrix:
 
 
 def band(count: int) -> sparse.csc_matrix:
-    """Upper triangle of a band matrix with bandwidth four."""
+    """Return the upper triangle of a band matrix with bandwidth four."""
     return sparse.csc_matrix(np.triu(np.tri(count, k=4).T.astype(float)) * (np.tri(count, k=4) > 0))
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [1, 7, 64, 65, 130, 259])
 def test_matrices_of_every_size_are_inverted_by_halves(count: int, device: str) -> None:
-    """With an added diagonal, by dense and sparse factors; a NaN is rejected."""
+    """Dense and sparse factors solve a matrix plus a diagonal; a matrix with NaN is rejected."""
     upper = pattern(count)
     dense, thin = TiledCholesky(upper, device=device), MultifrontalLdl(upper)
     random = np.random.default_rng(count)
@@ -77,7 +77,8 @@ def test_matrices_of_every_size_are_inverted_by_halves(count: int, device: str) 
 
 @pytest.mark.parametrize("count", [3, 64, 65, 129, 500, 1704])
 def test_diagonal_blocks_fill_one_thread_block(count: int) -> None:
-    """They are even, as large as the kernel allows within a factor of two, and cover the matrix."""
+    """Their side is even and, unless one block covers the matrix, more than half of the kernel's maximum. Together they
+    cover the matrix."""
     inverse = _TriangularInverse(count, GraphStream(torch.device("cpu")))
     side, size = inverse._side, inverse._size
     assert side % 2 == 0 and side <= MAX_ROWS and (2 * side > MAX_ROWS or size == side)
@@ -86,8 +87,8 @@ def test_diagonal_blocks_fill_one_thread_block(count: int) -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_slabs_of_a_long_body_are_factored_at_once(device: str) -> None:
-    """Also from a captured graph, and with a low-rank term between two matrices; a matrix that is indefinite only in a
-    slab or only in the separator has no factors."""
+    """The factors are correct in repeated calls, which replay a captured graph, and with a low-rank term between two
+    matrices. A matrix that is indefinite only in a slab or only in the separator has no factors."""
     count = 150
     upper = band(count)
     slabs = Dissection.of(upper)
@@ -165,7 +166,8 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [1, 70])
 def test_low_rank_terms_need_no_new_factorization(count: int, device: str) -> None:
-    """Positive, then negative terms; if the sum is indefinite, there are no factors until the next matrix."""
+    """Terms are added to and subtracted from a factored matrix. If the sum is indefinite, there are no factors until
+    the next matrix."""
     upper, random = pattern(60), np.random.default_rng(5)
     factors, right = TiledCholesky(upper, device=device), random.normal(size=(60, 4))
     directions = np.vstack([random.normal(size=(count, 60)), np.zeros((3, 60))])
@@ -213,8 +215,8 @@ def test_factors_keep_temporary_memory_of_warp() -> None:
 @pytest.mark.cuda
 @pytest.mark.parametrize(("parts", "between"), SIZES)
 def test_tiles_make_the_inverse_of_a_factor(parts: list[int], between: int) -> None:
-    """Previous contents of the output do not matter; results are bitwise equal, also after an indefinite matrix and for
-    any number of blocks."""
+    """Results do not depend on previous contents of the output, and are bitwise equal after an indefinite matrix and
+    for any number of thread blocks."""
     count = sum(parts) + between
     random = np.random.default_rng(count)
     order = random.permutation(count)

@@ -15,7 +15,7 @@ from egs_warp.geometry.camera import Camera, fitted_camera
 def test_a_fitted_camera_is_the_nearest_that_shows_all(
     width: int, height: int, stretch: tuple[float, float, float]
 ) -> None:
-    """All points are within the margins, and from a little nearer they would not be."""
+    """All points are within the margins; a camera that is slightly nearer does not show all of them."""
     points = np.random.default_rng(0).normal(0.0, 1.0, (200, 3)) * stretch + [3.0, -2.0, 7.0]
     start = Camera.look_at(np.array([2.0, -5.0, 1.5]), np.zeros(3), np.eye(3)[2], width=width, height=height)
     camera = fitted_camera(start, points, sides=0.8, top=0.9, bottom=0.6)

@@ -1,4 +1,4 @@
-"""Selections of Gaussians."""
+"""Selections of Gaussians: hidden below a plane, or most visible."""
 
 from __future__ import annotations
 
@@ -24,9 +24,8 @@ def test_what_lies_below_a_plane_is_hidden_and_stays_in_its_place() -> None:
 
 
 def test_gaussians_that_reach_far_below_a_plane_are_hidden() -> None:
-    """Gaussians with their means on the plane are hidden if they stand on it, and stay if they lie on it.
-
-    A third of the mass must be below the plane.
+    """A Gaussian is hidden if at least a third of its mass is below the plane: with its mean on the plane, if it is
+    upright, but not if it lies in the plane.
     """
     half = np.sqrt(0.5)
     cloud = GaussianCloud.from_numpy(
@@ -41,7 +40,8 @@ def test_gaussians_that_reach_far_below_a_plane_are_hidden() -> None:
 
 
 def test_the_most_visible_are_wide_and_opaque_and_keep_their_order() -> None:
-    """A needle has a small area; a negative logit of -800 is an opacity of 0 without an overflow."""
+    """Visibility is opacity times area, so a long needle counts as much as a small disc. A logit of -800 gives the
+    opacity 0 without overflow."""
     scales = np.log([[0.3, 0.3, 0.01], [0.4, 0.4, 0.01], [9.0, 0.01, 0.01], [0.5, 0.5, 0.5], [1.0, 1.0, 1.0]])
     cloud = GaussianCloud.from_numpy(
         np.arange(15.0).reshape(5, 3),

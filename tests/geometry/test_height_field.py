@@ -39,7 +39,8 @@ def test_ground_interpolates_its_nodes_and_follows_waves() -> None:
 
 
 def test_normals_are_the_gradient_of_the_gap() -> None:
-    """By central differences, exact on the ground and to first order in the height above it."""
+    """The normals equal the gradient by central differences: exactly on the ground, and to first order in the height
+    above it."""
     field = tilted(wavy_ground(0.05))
     points = scattered(field)
     on = points - field.heights(points)[:, None] * field.normal
@@ -58,7 +59,8 @@ def test_normals_are_the_gradient_of_the_gap() -> None:
 
 
 def test_frames_rotate_continuously() -> None:
-    """Along a line of 4,000 points across many cells and beyond the grid, the frames of neighbours differ by little."""
+    """Along a line of 4,000 points across many cells and beyond the grid, the axes of neighbours differ by less than
+    0.005."""
     field = tilted(wavy_ground(0.05, reach=1.0))
     line = field.origin + np.linspace(-0.3, 2.5, 4000)[:, None] * (field.axes[0] + 0.7 * field.axes[1])
     assert np.abs(np.diff(field.frames(line), axis=0)).max() < 5e-3
@@ -102,7 +104,7 @@ def test_top_is_where_a_vertical_line_meets_the_ground() -> None:
 
 
 def test_coarser_ground_keeps_long_waves() -> None:
-    """Waves of 16 new spacings keep 97 % of their height, those of two a third or less; no wave is displaced."""
+    """Waves of 16 new spacings change by at most 3 % of their height; waves of two keep at most 35 %."""
     field = wavy_ground(0.03, spacing=0.02)
     coarse = field.coarser(0.05)
     assert coarse.spacing == 0.05 and len(coarse.coefficients) < 0.5 * len(field.coefficients)

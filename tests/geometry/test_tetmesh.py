@@ -13,7 +13,8 @@ from tests.support.meshes import box_mesh
 
 
 def test_surface_and_edges_are_those_of_the_tetrahedra() -> None:
-    """The surface is closed, encloses the volume, and is read-only, since all callers share the cached array."""
+    """The surface is closed and encloses the volume. Its array is cached and shared by all callers, and therefore
+    read-only."""
     mesh = box_mesh((2, 2, 3), (0.5, 0.5, 1.0))
     faces = mesh.boundary_faces()
     a, b, c = mesh.nodes[faces].transpose(1, 0, 2)

@@ -14,8 +14,8 @@ from egs_warp.geometry.unique_rows import distinct_rows
     ("unit", "whole"), [(1, np.int32), (2**28, np.int32), (1, np.int64), (2**28, np.int64), (10**18, np.int64)]
 )
 def test_distinct_rows_equal_those_of_numpy(count: int, width: int, unit: int, whole: type) -> None:
-    """In the same order, with the same indices, also for negative numbers and for rows too far apart to be packed into
-    one number."""
+    """Order and indices equal NumPy's, also for negative numbers and for values too large to be packed into one number
+    per row."""
     rows = np.random.default_rng(count).integers(-4, 4, (count, width)) * [unit, *[1] * (width - 1)]
     rows = rows.astype(whole)
     distinct, number = distinct_rows(rows)

@@ -1,4 +1,4 @@
-"""New floor: its position and looks, and the errors. Eq. (18) gives its depth."""
+"""Inpainted floor: its position (Eq. 18) and appearance, and the error messages."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def look(azimuth: float, elevation: float, *, size: int = 160) -> Camera:
 
 
 def holed(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
-    """Return the floor without its Gaussians in the hole, with a dark blob there."""
+    """Return the floor with a dark blob in place of its Gaussians in the hole."""
     kept = truth.subset(~hole.window.sample(hole.mask, truth.means.numpy()))
     blob = GaussianCloud.from_numpy(
         on_plane(0.1, 0.05)[None] + 0.03 * PLANE.normal,
@@ -55,13 +55,13 @@ def holed(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
 
 @pytest.fixture(scope="module")
 def done() -> tuple[GaussianCloud, InpaintResult]:
-    """A glossy floor, before its hole is made and after it is filled."""
+    """Return a glossy floor without a hole, and the result of filling a hole in it."""
     truth, hole = floor(gloss=0.1), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     return truth, inpaint(holed(truth, hole), hole, options=InpaintOptions(steps=30))
 
 
 def test_filled_floor_looks_like_the_truth(done: tuple[GaussianCloud, InpaintResult]) -> None:
-    """From the side, the PSNR in the hole is 28 dB; the blob is gone, and the new floor is opaque."""
+    """From oblique views, the PSNR in the hole is at least 28 dB, so the blob is gone, and the new floor is opaque."""
     truth, result = done
     for azimuth, elevation in ((0.3, 0.6), (2.5, 1.0)):
         camera = look(azimuth, elevation)
@@ -73,8 +73,8 @@ def test_filled_floor_looks_like_the_truth(done: tuple[GaussianCloud, InpaintRes
 
 
 def test_depth_is_that_of_the_plane(done: tuple[GaussianCloud, InpaintResult]) -> None:
-    """Eq. (18): the rendered depth of the new Gaussians is the plane's to half a spacing (a splat has one depth, and
-    splats in front hide those behind)."""
+    """Eq. (18): the rendered depth of the new Gaussians differs from the depth of the plane by at most half a spacing.
+    It is not exact, because each splat has a single depth, and splats in front hide those behind."""
     _, result = done
     camera = look(1.0, 0.7)
     image = render_gaussians(result.cloud.subset(result.is_new), camera)
@@ -112,7 +112,8 @@ def test_new_gaussians_have_the_gloss_of_the_floor_but_their_own_colour(
 
 @pytest.mark.slow
 def test_training_reduces_the_error_to_the_painted_image() -> None:
-    """Seen face-on, the error of the image decreases; means and rotations stay the same."""
+    """Seen face-on, the error to the painted image decreases by at least 30 %, and the means stay the same. The result
+    without training is deterministic."""
     truth, hole = floor(), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     damaged = holed(truth, hole)
 
@@ -138,7 +139,7 @@ def test_new_floor_continues_a_floor_beside_the_plane() -> None:
 
 
 def test_laplace_fill_and_rim_heights() -> None:
-    """Harmonic polynomials are reproduced; for a tilted floor with a crack, the crack is ignored."""
+    """The Laplace equation reproduces harmonic polynomials; rim heights of a tilted floor ignore a crack."""
     rows, columns = (values - 20.0 for values in np.indices((41, 41)).astype(float))
     hole = np.hypot(rows, columns) < 12
     saddle = rows**2 - columns**2 + 3.0 * columns
@@ -150,7 +151,8 @@ def test_laplace_fill_and_rim_heights() -> None:
 
 
 def test_window_camera_and_rectified_image() -> None:
-    """Texels are where the camera projects them, colours are those of the pattern, heights those of the floor."""
+    """The camera of a window projects its texels onto its pixels; a rectified image has the colours of the pattern and
+    the heights of the floor."""
     window = PlaneWindow(PLANE, on_plane(0.2, -0.1), 0.01, 60, 80)
     pixels = np.array([[0.5, 0.5], [79.5, 10.5], [33.0, 59.0]])
     points = window.points(pixels)
@@ -172,8 +174,8 @@ def test_window_camera_and_rectified_image() -> None:
 
 
 def test_threads_at_two_heights_keep_their_contrast() -> None:
-    """Oblique views see bright threads in front of dark ones, in each view at another place: the mean of the views
-    alone has a contrast of 0.11 instead of 0.23."""
+    """Bright threads are above dark ones, so oblique views show them displaced, each in another direction. The plain
+    mean of the views would have a contrast of 0.11 instead of 0.23."""
     window = PlaneWindow(PLANE, on_plane(0.0, 0.0), 0.01, 80, 80)
     columns, rows = np.meshgrid(*[np.arange(-20.0, 100.0, 0.5) + 0.25] * 2)
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
@@ -191,7 +193,8 @@ def test_threads_at_two_heights_keep_their_contrast() -> None:
 
 
 def test_footprints_and_common_occlusion() -> None:
-    """The base of a pawn is a disc, and a stool stands on four feet; masks of a disc on the plane yield the disc."""
+    """The footprint of a pawn is a disc, and that of a stool is four small feet; masks of a disc on the plane yield the
+    disc."""
     pawn, stool = scene("pawn"), scene("stool")
     assert footprint(pawn.object, pawn.plane).area == pytest.approx(np.pi * 0.3**2, rel=0.1)
     feet = footprint(stool.object, stool.plane)
@@ -222,7 +225,8 @@ def test_footprints_and_common_occlusion() -> None:
 
 
 def test_overhanging_objects_stay() -> None:
-    """A shelf as high above the floor as the hole is wide does not belong to the floor; haze at the foot is removed."""
+    """A shelf above the floor, at a height equal to the diameter of the hole, is not removed; the blob in the hole
+    is."""
     truth, hole = floor(spacing=0.04), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     shelf = floor(spacing=0.04, half=0.4, height=2.0 * RADIUS)
     background = concatenate(holed(truth, hole), shelf)
@@ -276,7 +280,7 @@ def test_bad_options_and_objects() -> None:
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From files to a filled capture and an image; no gap remains."""
+    """The command reads files and writes a filled capture without a gap and an image; errors are one line."""
     truth, hole = floor(spacing=0.04), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     write_ply(tmp_path / "background.ply", holed(truth, hole))
     write_planes(tmp_path / "plane.json", [PlaneRecord(PLANE)])

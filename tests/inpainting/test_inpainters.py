@@ -1,4 +1,4 @@
-"""OpenCV, ONNX and TorchScript behind the same protocol, and their errors."""
+"""Inpainters with the same protocol, by OpenCV, ONNX and TorchScript, and their error messages."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 
 class MeanOfTheKnown(torch.nn.Module):
-    """Paints the hole in the mean colour of the rest: a minimal network with the interface of LaMa."""
+    """Minimal network with the interface of LaMa: it fills the hole with the mean colour of the other pixels."""
 
     def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         mean = (image * (1 - mask)).sum(dim=(2, 3), keepdim=True) / (1 - mask).sum(dim=(2, 3), keepdim=True)
@@ -103,8 +103,8 @@ def test_bad_networks(tmp_path: Path) -> None:
 
 
 def grey_paint(*, external: str | None = None, gain: float = 1.0) -> bytes:
-    """Return a network that paints the hole in 0.25, 0.5, 0.75 times ``gain``; with ``external`` its colour is in a
-    separate file."""
+    """Return an ONNX network that fills the hole with the colour (0.25, 0.5, 0.75) times ``gain``. With ``external``,
+    the colour is in a separate file of that name."""
     names = ("batch", "height", "width")
     return onnx.model(
         [

@@ -40,7 +40,7 @@ def test_cut_is_the_optimum() -> None:
 
 
 def test_labels_point_to_similar_known_texels() -> None:
-    """In an exactly periodic image every source is a whole number of periods away."""
+    """In a periodic image, each texel of the hole gets a known source texel whose colour differs by less than 0.02."""
     image = picture()
     hole = round_hole(128, (70, 60), 13)
     known = np.ones_like(hole)
@@ -66,8 +66,8 @@ def test_a_repeating_texture_is_continued(device: str) -> None:
 
 
 def test_an_illumination_gradient_leaves_no_seam() -> None:
-    """For a texture under a gradient of light, the error is below a sixtieth of the light's range, without a step at
-    the rim."""
+    """For a texture under a gradient of illumination, the PSNR exceeds 30 dB, and the error at the rim is less than a
+    tenth of the range of the illumination."""
     fade = np.linspace(-0.1, 0.1, 128, dtype=np.float32)[None, :, None]
     image = 0.7 * picture() + 0.15 + fade
     hole = round_hole(128, (64, 64), 15)
@@ -78,7 +78,8 @@ def test_an_illumination_gradient_leaves_no_seam() -> None:
 
 
 def test_blending_keeps_gradients_and_removes_steps() -> None:
-    """A copy that is 0.1 too bright is corrected from its rim; where sources and votes agree nothing changes."""
+    """A copied region that is 0.1 too bright is corrected from its rim; where sources and votes agree, nothing
+    changes."""
     image = picture().astype(np.float64)
     image[:, 64:] += 0.1
     hole = round_hole(128, (64, 32), 9)
@@ -112,7 +113,7 @@ def test_no_patch_of_a_distant_texture(seed: int) -> None:
 
 
 def test_an_image_without_source_patches() -> None:
-    """Except for a few columns, the image consists of the hole."""
+    """The hole covers the image except for a few columns."""
     hole = np.ones((40, 40), bool)
     hole[:, :3] = False
     with pytest.raises(UserError, match="no piece of 7 x 7 texels is known around the hole; make the hole smaller"):
@@ -121,7 +122,7 @@ def test_an_image_without_source_patches() -> None:
 
 @pytest.mark.slow
 def test_shaded_texels_are_not_copied():
-    """There is shade on one side of the hole: without the shade mask the filled hole is darker."""
+    """One side of the hole is in shade; without the mask of shaded texels, the filled hole would be darker."""
     rows, columns = np.indices((96, 96))
     hole = np.hypot(rows - 48, columns - 48) < 14
     shade = (columns < 44) & (np.abs(rows - 48) < 24) & ~hole

@@ -1,4 +1,4 @@
-"""Stains that the shadow and the foot of an object leave on the floor."""
+"""Detection of stains that the shadow and the foot of an object leave on the floor."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ def test_a_pattern_is_no_stain(width: int):
 
 
 def test_the_darkest_squares_of_a_checked_cloth_are_no_stain():
-    """A quarter of the cloth is dark, which a robust estimate of the deviation does not reflect."""
+    """A quarter of the cloth is dark; a robust estimate of the deviation underestimates that."""
     stripes = [(axis // 24) % 2 for axis in (ROWS, COLUMNS)]
     cloth = (1.0 - 0.3 * stripes[0] * stripes[1])[..., None] * weave()
     assert not stain_around(HOLE, ~HOLE, cloth).any()
 
 
 def test_a_seam_that_continues_is_no_stain():
-    """A seam between planks that begins at the hole."""
+    """A seam between planks begins at the hole and continues beyond."""
     wide = np.indices((360, 360))
     hole = np.hypot(*(wide - 180)) < 50
     seam = (np.abs(wide[1] - 180) < 8) & (np.abs(wide[0] - 180) < 140)

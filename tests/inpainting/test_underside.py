@@ -1,5 +1,5 @@
-"""The underside of an object that was sunk into its ground: closed from the rim, in the rim's colours, only where it is
-open."""
+"""The underside of an object that was sunk into its ground is closed between the rims, in the colours of the rim, and
+only where it is open."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ SIZE = 1.7
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_a_ball_sunk_into_folds_is_closed(degree: int) -> None:
-    """The ball is sunk by a fifth of its radius: all new Gaussians lie within the rim, between its heights, and cover
-    it."""
+    """The ball is sunk into the ground by a fifth of its radius. All new Gaussians lie within the rim, laterally and in
+    height, and cover the opening."""
     ground = wavy_ground(0.03, spacing=0.04)
     whole = ball(-0.2 * RADIUS)
     thing = whole.subset(ground.heights(whole.means.numpy()) > 0.005)
@@ -49,7 +49,7 @@ def test_a_ball_sunk_into_folds_is_closed(degree: int) -> None:
 def test_an_underside_too_small_for_a_gaussian_stays_open(
     sides: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """There is no unseen texel at all, or no whole block of unseen texels: nothing is added, and there is no error."""
+    """If there is no unseen texel, or no full block of unseen texels, nothing is added, and there is no error."""
     hole, known = np.zeros((2, 16, 16), bool)
     known[:] = True
     for number, side in enumerate(sides):
@@ -70,7 +70,7 @@ def test_a_closed_underside_is_unchanged() -> None:
 
 
 def test_a_coarse_object_gets_few_gaussians() -> None:
-    """There are at most a fifth as many new Gaussians as the object has, and they cover the same opening."""
+    """The number of new Gaussians is at most a fifth of the object's own, and they cover the same opening."""
     ground, whole = wavy_ground(0.03, spacing=0.04), ball(-0.2 * RADIUS)
     thing = whole.subset(ground.heights(whole.means.numpy()) > 0.005)
     fine, many = with_underside(thing, ground, SIZE)

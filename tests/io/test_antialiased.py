@@ -1,4 +1,4 @@
-"""A capture that was trained with antialiasing stays one: in every file that can state it, and in what is drawn."""
+"""The antialiasing flag of a capture: kept by every file format that can store it, and used by the renderer."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def _member(shape: str, dtype: str, data: bytes = b"") -> bytes:
     ],
 )
 def test_arrays_that_declare_more_than_the_file_holds(member: bytes, said: str, tmp_path: Path) -> None:
-    """They are refused before memory is allocated for them."""
+    """Arrays that are larger than the file, or of objects, are refused before memory is allocated for them."""
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("a.npy", member)
     with pytest.raises(ValueError, match=said):

@@ -30,8 +30,8 @@ def test_spz_by_hand(version: int, tmp_path: Path) -> None:
     if version < 3:
         rotation = bytes([128, round((-0.6 + 1) * 127.5), 128])
     else:
-        # Components x, y, z, w. The largest, w (index 3), is omitted; each other has a sign bit and nine bits of |c|
-        # sqrt(2).
+        # Components x, y, z, w. The largest, w (index 3), is omitted; every other one has a sign bit and nine bits
+        # of |c| sqrt(2).
         rotation = struct.pack("<I", 3 << 30 | 0 << 20 | (512 | round(0.6 * 2**0.5 * 511)) << 10 | 0)
     body = struct.pack("<IIIBBBB", 0x5053474E, version, 1, 1, 12, version == 3, 0) + position
     body += bytes([51]) + bytes([255, 128, 0]) + bytes([160, 96, 0]) + rotation
@@ -64,7 +64,8 @@ def test_spz_of_streams_equals_version_3(degree: int, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_spz_of_streams_is_written_as_described(degree: int, tmp_path: Path) -> None:
-    """Header, table and streams of https://github.com/nianticlabs/spz, byte by byte; the blocks are those of 3."""
+    """Header, table and streams follow https://github.com/nianticlabs/spz byte by byte; the decompressed data equal
+    those of version 3."""
     write_spz(tmp_path / "3.spz", make_cloud(900, degree))
     write_spz(tmp_path / "4.spz", make_cloud(900, degree), version=4)
     plain, data = gzip.decompress((tmp_path / "3.spz").read_bytes()), (tmp_path / "4.spz").read_bytes()
@@ -88,14 +89,15 @@ def _one_spz(tmp_path: Path) -> bytes:
 
 @pytest.mark.parametrize(("axes", "up"), [(4, (0, 1, 0)), (6, (0, -1, 0)), (12, (0, 0, 1)), (9, (0, 0, -1))])
 def test_spz_of_streams_declares_the_up_direction(axes: int, up: tuple[int, int, int], tmp_path: Path) -> None:
-    """RUB, RDF, RFU and LFD, after a record of another kind."""
+    """The axes are RUB, RDF, RFU or LFD, declared after a record of another kind."""
     records = struct.pack("<IIfff", 0xADBE0002, 12, 0.0, 1.0, 2.0) + struct.pack("<III", 0xADBE0003, 4, axes)
     (tmp_path / "4.spz").write_bytes(spz_of_streams(_one_spz(tmp_path), 1, 0, records))
     np.testing.assert_array_equal(read_capture(tmp_path / "4.spz", device="cpu").up, up)
 
 
 def test_left_handed_spz_is_mirrored(tmp_path: Path) -> None:
-    """LUB, as Unity has it: the same body seen in RUB."""
+    """A file in Unity's left-handed axes LUB is read in RUB, so that it shows the mirror image of a RUB file with the
+    same numbers."""
     write_spz(tmp_path / "3.spz", make_cloud(50, 3))
     plain = gzip.decompress((tmp_path / "3.spz").read_bytes())
     records = struct.pack("<III", 0xADBE0003, 4, 3)
@@ -157,7 +159,7 @@ def test_splat_by_hand(tmp_path: Path) -> None:
 
 
 def test_compressed_ply_by_hand(tmp_path: Path) -> None:
-    """The oldest layout, without colour bounds; extreme and middle values of each packed field."""
+    """The file has the oldest layout, without colour bounds, and extreme and middle values of each packed field."""
     names = ["min_x", "min_y", "min_z", "max_x", "max_y", "max_z"]
     names += ["min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z"]
     header = "ply\r\nformat binary_little_endian 1.0\r\nelement chunk 1\r\n"

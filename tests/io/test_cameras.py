@@ -1,4 +1,4 @@
-"""Camera poses: real photos, conventions by hand, bad files."""
+"""Camera poses: real photos, hand-made files in each convention, and bad files."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from tests.support.properties import examples
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixel coordinates (n, 2) and z-depth (n,) of world points (n, 3)."""
+    """Return the pixel coordinates (n, 2) and depths (n,) along the optical axis of world points (n, 3)."""
     seen = points @ camera.rotation.T + camera.translation
     pixels = seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     return pixels, seen[:, 2]
 
 
 def inside(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return True if each pixel coordinate falls on a set pixel; centres lie at +0.5."""
+    """Return (n,) bool: True for each pixel coordinate (n, 2) that falls on a set pixel. Pixel centres lie at +0.5."""
     columns, rows = np.floor(pixels).astype(int).T
     height, width = mask.shape
     valid = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
@@ -75,7 +75,8 @@ def test_plush_dog_gaussians_land_on_the_dog(data_dir: Path) -> None:
 
 @pytest.mark.data
 def test_lego_masks_carve_a_bulldozer(data_dir: Path) -> None:
-    """NeRF-synthetic: the points inside all 100 silhouettes fill the silhouettes again, which only true poses do."""
+    """NeRF-synthetic: the grid points inside all 100 silhouettes fill each silhouette, which they do only for correct
+    poses."""
     posed = read_cameras(data_dir / "posed/lego")
     assert len(posed) == 100
     ticks = np.linspace(-1.4, 1.4, 71)
@@ -101,7 +102,7 @@ def test_lego_masks_carve_a_bulldozer(data_dir: Path) -> None:
 
 # Conventions by hand -------------------------------------------------------------------------------------------------
 
-# The camera stands at (1, 2, 3), looks along +x, with +z up in the image: right is -y, down is -z.
+# The camera is at (1, 2, 3), its optical axis is +x, and +z is up in the image: right is -y, down is -z.
 ROTATION = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 CENTRE = np.array([1.0, 2.0, 3.0])
 

@@ -1,4 +1,4 @@
-"""Captures: real files and round trips."""
+"""Captures: real files, and round trips through each format."""
 
 from __future__ import annotations
 
@@ -26,15 +26,16 @@ from tests.support.captures import ARRAYS, assert_same_bits, make_cloud
 
 
 def angles_degrees(first: GaussianCloud, second: GaussianCloud) -> np.ndarray:
-    """Return the angle of each rotation from one cloud to the other, computed by the sine, which is exact for small
-    angles."""
+    """Return the angles (n,), degrees, between corresponding rotations of two clouds, by the arcsine, which is accurate
+    for small angles."""
     p, q = first.rotations.numpy().astype(float), second.rotations.numpy().astype(float)
     p *= np.sign(np.einsum("ni,ni->n", p, q))[:, None]
     return np.degrees(4.0 * np.arcsin(np.linalg.norm(p - q, axis=1) / 2.0))
 
 
 def test_parts_and_copies_of_a_capture_keep_the_facts_about_its_file(tmp_path: Path) -> None:
-    """Up of the file, for example, which ``make_creature`` takes from the capture."""
+    """Parts and pickled copies have the up direction, source and format of the file, and the rows of their
+    Gaussians."""
     write_spz(tmp_path / "a.spz", make_cloud(50, 1))
     capture = read_capture(tmp_path / "a.spz", device="cpu")
     part = capture.subset(np.arange(10, 50)).subset(np.array([0, 3]))
@@ -75,7 +76,7 @@ def test_real_captures_read(name: str, data_dir: Path) -> None:
     assert 5e-4 < np.median(sizes.max(axis=1)) / extent < 0.05
     colours = 0.5 + SH_BAND_0 * cloud.sh.numpy()[:, 0]
     assert np.mean((colours > -0.2) & (colours < 1.2)) > 0.97
-    # A Gaussian's size is about the distance to its neighbours: true only if scales and means were both decoded.
+    # A Gaussian's size is similar to the distance to its neighbours only if scales and means were both decoded.
     distance = KDTree(cloud.means.numpy()).query(cloud.means.numpy()[::97], k=4)[0][:, 3]
     assert 0.2 < np.median(sizes.max(axis=1)[::97] / np.maximum(distance, 1e-9)) < 20.0
     if name.endswith(".spz"):
@@ -86,7 +87,7 @@ def test_real_captures_read(name: str, data_dir: Path) -> None:
 
 @pytest.mark.data
 def test_plush_dog_agrees_with_its_compressed_twin(data_dir: Path) -> None:
-    """The same capture written by SuperSplat in both layouts: equal up to half a step of each packed number."""
+    """SuperSplat wrote the same capture in both layouts; all values agree to half a step of each packed number."""
     plain = read_capture(data_dir / "objects/plush_dog.ply", device="cpu").cloud
     packed = read_capture(data_dir / "objects/plush_dog.compressed.ply", device="cpu").cloud
 
@@ -104,7 +105,7 @@ def test_plush_dog_agrees_with_its_compressed_twin(data_dir: Path) -> None:
 
     for name, bits in (("means", (11, 10, 11)), ("log_scales", (11, 10, 11))):
         exact, read = getattr(plain, name).numpy(), getattr(packed, name).numpy()
-        # Clamped scales (SuperSplat keeps -20 ... 20) do not occur in this capture.
+        # This capture has no scales outside SuperSplat's range, -20 to 20.
         assert np.all(np.abs(read - exact) <= 1.02 * half_steps(exact, bits) + 2e-6), name
     colours = plain.sh.numpy()[:, 0]
     assert np.all(np.abs(packed.sh.numpy()[:, 0] - colours) <= 1.02 * half_steps(colours, (8, 8, 8)) + 2e-5)
@@ -143,7 +144,7 @@ def test_real_captures_survive_ply(name: str, data_dir: Path, tmp_path: Path) ->
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["scenes/narcissus.sog", "scenes/playbot"])
 def test_real_sog_survives_being_written_again(name: str, data_dir: Path, tmp_path: Path) -> None:
-    """A capture with at most 256 different scales and colours loses only the rounding of its rotations."""
+    """In a capture with at most 256 different scales and colours, only the rotations are rounded."""
     cloud = read_capture(data_dir / name, device="cpu").cloud
     write_sog(tmp_path / "a.sog", cloud, keep_order=True)
     again = read_capture(tmp_path / "a.sog", device="cpu").cloud
@@ -162,7 +163,7 @@ WRITERS: dict[str, Callable[..., object]] = {
     "a.splat": write_splat,
     "a.sog": lambda path, cloud: write_sog(path, cloud, keep_order=True),
 }
-# Largest error of means, log scales, rotations in degrees, colour of band 0, and higher SH: half a step of each grid.
+# Maximum errors of means, log scales, rotations (degrees), colour of band 0, and higher SH: half a step of each grid.
 TOLERANCES = {
     "a.compressed.ply": (0.5 * 4.0 / 1023.0, 0.5 * 7.0 / 1023.0, 0.25, 0.5 * 1.8 / 255.0, 1.0 / 64.0),
     "a2.spz": (2.0**-13, 1.0 / 32.0, 12.0, 0.5 / 255.0 / 0.15, 0.0625),
@@ -208,7 +209,8 @@ def test_sorted_in_space_holds_the_same_gaussians(write: Callable[..., None], tm
 
 
 def test_sog_with_more_sh_sets_than_the_palette_holds(tmp_path: Path) -> None:
-    """70,000 Gaussians of 300 kinds share 65,536 palette entries: nearly all keep their own coefficients."""
+    """70,000 Gaussians with similar coefficients of 300 kinds share 65,536 palette entries; the error of every
+    coefficient is less than 0.01."""
     rng = np.random.default_rng(0)
     kinds = rng.uniform(-0.5, 0.5, (300, 4, 3))
     base = make_cloud(70_000)
@@ -234,7 +236,7 @@ def test_sequence_names(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("first", [b"{", b"PK", b"\x1f\x8b"])
 def test_a_splat_may_begin_with_any_coordinate(tmp_path: Path, first: bytes) -> None:
-    """The format has no magic number: in one of 256 files the first byte is that of JSON."""
+    """The format has no magic number: one of 256 files begins with the first byte of JSON, for example."""
     write_splat(tmp_path / "a.splat", pawn(gaussian_count=50, device="cpu").cloud)
     data = (tmp_path / "a.splat").read_bytes()
     (tmp_path / "a.splat").write_bytes(first + data[len(first) :])

@@ -14,7 +14,7 @@ from tests.support.photo_sets import CAMERA_LINE, NAMES, cameras, image_lines, w
 
 LINES = image_lines()
 POINTS = "1.5 2.5 -1 3.5 4.5 7"
-# All whole numbers, of which the first line could be an image, but for its place.
+# All values are integers, so the line could be an image line if it were not for its position.
 WHOLE_POINTS = "3 4 -1 5 6 -1 7 8 2 9 10 -1"
 
 

@@ -88,7 +88,7 @@ def test_small_numbers_and_strides(tmp_path: Path) -> None:
 
 
 def test_a_rotated_node_declares_the_up_direction(tmp_path: Path) -> None:
-    """A mesh with z up, under a node that rotates it to y up, as exporters write it."""
+    """Exporters write a mesh with z up under a node that rotates it to y up; the capture then has z up."""
     write_glb(tmp_path / "a.glb", make_cloud(20))
     tree, binary = _parts(tmp_path / "a.glb")
     tree["nodes"] = [{"mesh": 0}, {"children": [0], "rotation": [-(0.5**0.5), 0, 0, 0.5**0.5], "scale": [2, 2, 2]}]
@@ -156,7 +156,8 @@ def test_every_truncation_is_one_line(tmp_path: Path) -> None:
 
 
 def _with_nodes(folder: Path, cloud: GaussianCloud, nodes: list[dict[str, Any]], **more: Any) -> Capture:
-    """Read ``cloud`` as mesh 0 of a file with ``nodes``; those that are no child are the scene."""
+    """Write ``cloud`` as mesh 0 of a file with ``nodes``, of which those without a parent form the scene, and read
+    it."""
     write_glb(folder / "a.glb", cloud)
     tree, binary = _parts(folder / "a.glb")
     children = {child for node in nodes for child in node.get("children", [])}
@@ -173,7 +174,7 @@ def _covariances(cloud: GaussianCloud) -> np.ndarray:
 
 
 def _colours(cloud: GaussianCloud, directions: np.ndarray) -> np.ndarray:
-    """(n, 3) colours, without the constant, of each Gaussian seen along its own direction (n, 3)."""
+    """Return the colours (n, 3), without the constant, of each Gaussian seen along its own direction (n, 3)."""
     x, y, z = directions.T
     basis = [np.full(len(x), 0.2820948), -0.4886025 * y, 0.4886025 * z, -0.4886025 * x]
     basis += [1.0925484 * x * y, -1.0925484 * y * z, 0.3153916 * (2 * z * z - x * x - y * y)]
@@ -217,8 +218,8 @@ def _euler(*degrees: float) -> Rotation:
     ],
 )
 def test_turned_mirrored_and_stretched_nodes(rotation: Rotation, scale: tuple[float, ...], tmp_path: Path) -> None:
-    """Covariances become M Sigma M^T, and the colour seen along Q d is that which was seen along d; Q is the orthogonal
-    factor of M."""
+    """Covariances become M Sigma M^T. The colour seen along Q d equals the one that was seen along d, where Q is the
+    orthogonal factor of M."""
     cloud = make_cloud(40, 3)
     second = {"mesh": 0, "rotation": rotation.as_quat().tolist(), "scale": scale, "translation": [1, 2, 3]}
     read = _with_nodes(tmp_path, cloud, [{"mesh": 0}, second]).cloud.subset(np.arange(40, 80))
@@ -236,7 +237,7 @@ def test_turned_mirrored_and_stretched_nodes(rotation: Rotation, scale: tuple[fl
 
 @pytest.mark.parametrize("scale", [(-1, 1, 1), (1, 2, 1)])
 def test_one_mirrored_or_stretched_node_is_applied(scale: tuple[float, ...], tmp_path: Path) -> None:
-    """Otherwise the capture would be mirrored or of another shape."""
+    """The transform of a single node is applied if the capture would otherwise be mirrored or have another shape."""
     cloud = make_cloud(20)
     read = _with_nodes(tmp_path, cloud, [{"mesh": 0, "scale": scale}])
     np.testing.assert_allclose(read.cloud.means.numpy(), cloud.means.numpy() * scale, atol=1e-6)
@@ -314,7 +315,7 @@ def test_required_extensions(required: list[str], message: str | None, tmp_path:
 
 
 def test_a_buffer_without_data_is_not_that_of_the_file(tmp_path: Path) -> None:
-    """As EXT_meshopt_compression has it, here without requiring the extension."""
+    """EXT_meshopt_compression has such buffers. The file uses the extension without listing it as required."""
     write_glb(tmp_path / "a.glb", make_cloud(10))
     tree, binary = _parts(tmp_path / "a.glb")
     tree["buffers"].append({"byteLength": len(binary), "extensions": {"EXT_meshopt_compression": {"fallback": True}}})
@@ -342,7 +343,7 @@ def test_nodes_that_form_no_tree(tmp_path: Path) -> None:
 def _packed(
     folder: Path, cloud: GaussianCloud, *, version: int = 2, turned: bool = False, bounds: bool = True
 ) -> tuple[dict[str, Any], bytes]:
-    """Return a tree and its buffer: ``cloud`` as a .spz, without data for the accessors."""
+    """Return the glTF tree and the buffer of ``cloud`` packed as .spz; the accessors have no data."""
     write_glb(folder / "a.glb", cloud)
     write_spz(folder / "a.spz", cloud, version=version)
     tree, _ = _parts(folder / "a.glb")
@@ -374,7 +375,7 @@ def test_packed_by_spz(version: int, bounds: bool, tmp_path: Path) -> None:
 
 
 def test_packed_by_spz_in_its_own_axes(tmp_path: Path) -> None:
-    """The draft demands that a .spz, whose axes are right, up and back, is read as left, up and front."""
+    """By the draft, the axes of the .spz data, right, up and back, are read as left, up and front."""
     cloud = make_cloud(50, 2)
     (tmp_path / "b.glb").write_bytes(_glb(*_packed(tmp_path, cloud, turned=True)))
     read = read_capture(tmp_path / "b.glb", device="cpu").cloud

@@ -1,4 +1,4 @@
-"""Small files that declare large contents: rejected before memory is allocated."""
+"""Small files that declare large contents are rejected before memory is allocated."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.support.captures import good_bytes, message, written
 from tests.support.memory import megabytes_of
 
 HUGE = (13_300, 13_300)
-"""177 megapixels, just below Pillow's own bound."""
+"""Width and height of 177 megapixels, just below Pillow's own limit."""
 
 
 read_on_cpu = partial(read_capture, device="cpu")
@@ -54,7 +54,8 @@ def large_png(path: Path, size: tuple[int, int] = HUGE) -> Path:
 
 
 def test_pictures_larger_than_the_gaussians_need(tmp_path: Path) -> None:
-    """A .sog file of 1.6 kB whose images have 177 megapixels each."""
+    """A small .sog file whose images have 33.6 megapixels each is refused, because its 7 Gaussians need fewer
+    pixels."""
     data = io.BytesIO()
     Image.new("RGBA", (8192, 4096)).save(data, "WEBP", lossless=True)
     files = members()
@@ -96,7 +97,7 @@ def test_a_small_spz_of_many_gaussians(tmp_path: Path) -> None:
 
 
 def test_positions_without_an_integer_part(tmp_path: Path) -> None:
-    """255 fractional bits map every mean to the same point."""
+    """A .spz with 255 fractional bits, which would map all means to one point, is refused."""
     body = bytearray(gzip.decompress(good_bytes("a.spz")))
     body[13] = 255
     assert message(written(tmp_path / "a.spz", gzip.compress(bytes(body)))) == (
@@ -149,7 +150,7 @@ def test_a_mask_of_a_photo_is_measured_first(tmp_path: Path) -> None:
     camera = Camera(40, 30, 40.0, 40.0, 20.0, 15.0, np.eye(3), np.zeros(3))
     with pytest.raises(UserError, match="13300 x 13300 pixels, but its photo has 40 x 30"):
         read_photo(PosedImage("a.png", camera, tmp_path / "images" / "a.png", mask=tmp_path / "masks" / "a.png"))
-    # Of the photo's shape, and too large for it.
+    # This mask has the photo's aspect ratio, but is too large for it.
     large_png(tmp_path / "masks" / "a.png", (13_200, 9_900))
     with pytest.raises(UserError, match="13200 x 9900 pixels; at most 32768 a side and 307200 in all are read"):
         read_photo(PosedImage("a.png", camera, tmp_path / "images" / "a.png", mask=tmp_path / "masks" / "a.png"))

@@ -37,7 +37,7 @@ def document(
     label: str = "{}",
     extra: str = "",
 ) -> str:
-    """Metashape's cameras.xml, whose chunk is turned, scaled and shifted against the world."""
+    """Return the text of Metashape's cameras.xml; its chunk is rotated, scaled and shifted relative to the world."""
     frame = f"<transform><rotation>{spaced(TURN)}</rotation><translation>{spaced(SHIFT + offset)}</translation>"
     frame += f"<scale>{SCALE}</scale></transform>"
     entries = ""
@@ -74,7 +74,8 @@ def test_metashape(component: bool, label: str, tmp_path: Path) -> None:
 
 
 def test_metashapes_lens(tmp_path: Path) -> None:
-    """At one point, term by term as in the appendix of the manual; b1 is the difference of the focal lengths."""
+    """The distortion at one point equals the terms in the appendix of the manual; b1 is the difference of the focal
+    lengths."""
     number = {
         "k1": 0.1,
         "k2": -0.02,

@@ -1,4 +1,4 @@
-"""Files with names given by the user: files of different runs are not mixed, and no earlier file is lost."""
+"""Output files that the user names: files of different runs are not mixed, and no earlier file is lost."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def test_paths_are_checked_before_the_work_and_not_created(tmp_path: Path) -> No
 
 
 def test_recent_remnants_of_a_killed_run_are_removed_at_the_end(tmp_path: Path) -> None:
-    """Remnants of any age are removed: a training that is resumed at once finds recent half-written files, and may end
-    soon after."""
+    """Half-written files are removed whatever their age, because a training may be killed, resumed and finished within
+    seconds."""
     left = tmp_path / ".egs-0123456789abcdef.npz"
     left.write_text("half")
     write(tmp_path / "a.ply", text="1")

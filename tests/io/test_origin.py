@@ -46,7 +46,7 @@ def test_all_at_one_point() -> None:
 
 
 def test_files_with_a_place_for_the_offset_keep_it(tmp_path: Path) -> None:
-    """The .ply holds doubles, the .glb a translation of its node."""
+    """A .ply keeps the offset in positions of double precision, a .glb in the translation of its node."""
     cloud = make_cloud(200, 1)
     write_ply(tmp_path / "a.ply", cloud, origin=_PLACE)
     header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
@@ -64,7 +64,8 @@ def test_files_with_a_place_for_the_offset_keep_it(tmp_path: Path) -> None:
 
 
 def test_captures_beside_each_other_share_an_origin(tmp_path: Path) -> None:
-    """An object and its background are each relative to their own middle."""
+    """Positions of an object and of its background are relative to different origins; one is converted to the
+    other's."""
     cloud = make_cloud(200, 1)
     write_ply(tmp_path / "object.ply", cloud, origin=_PLACE)
     write_ply(tmp_path / "background.ply", cloud, origin=_PLACE + [40.0, 30.0, 0.0])
@@ -80,7 +81,8 @@ def test_captures_beside_each_other_share_an_origin(tmp_path: Path) -> None:
 
 
 def test_what_a_ply_holds_besides_is_reported(tmp_path: Path) -> None:
-    """Doubles that single precision cannot represent, properties and elements that are not read."""
+    """The report names doubles that single precision cannot represent, and properties and elements that are not
+    read."""
     write_ply(tmp_path / "a.ply", make_cloud(3))
     header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
     rows = np.frombuffer(body, "<f4").reshape(3, -1)

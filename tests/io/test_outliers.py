@@ -1,4 +1,4 @@
-"""A bad Gaussian does not spoil a capture: it is left out, and reported."""
+"""Outliers among the Gaussians of a capture are left out and reported."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def spoiled(path: Path, rows: slice | list[int], *, sh: float = 0.0, **values: f
 
 
 def unchecked(arrays: dict[str, np.ndarray]) -> GaussianCloud:
-    """Return a cloud with values that ``GaussianCloud.from_numpy`` refuses."""
+    """Return a cloud without the checks of ``GaussianCloud.from_numpy``."""
     kinds = {name: getattr(GOOD, name).dtype for name in arrays}
     made: dict[str, Any] = {name: wp.array(value, dtype=kinds[name], device="cpu") for name, value in arrays.items()}
     return GaussianCloud(**made)

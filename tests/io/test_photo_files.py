@@ -1,4 +1,4 @@
-"""Photos and masks where other tools put them."""
+"""Photos and masks are found in the folders and under the names that other tools use."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_photos_that_several_files_fit_are_reported(tmp_path: Path) -> None:
 
 
 def test_a_photo_of_another_folder_is_not_used(tmp_path: Path) -> None:
-    """The folder distinguishes photos of one name, as of a rig."""
+    """The folder distinguishes photos with the same name, for example from the cameras of a rig."""
     write_colmap(tmp_path / "sparse/0", FRONT_BACK)
     write_photos(tmp_path / "images/front", ["00.jpg", "01.jpg"])
     assert found(read_posed_images(tmp_path), tmp_path) == ["images/front/00.jpg", "images/front/01.jpg", None, None]
@@ -277,7 +277,7 @@ def test_kinds_of_mask_files(kind: str, tmp_path: Path) -> None:
 
 
 def test_alpha_and_masks_together(tmp_path: Path) -> None:
-    """An opaque alpha channel has no information; another one and the mask both count."""
+    """An opaque alpha channel is ignored; any other one is combined with the mask."""
     mask = silhouettes(1)[0]
     rgba = np.dstack([np.full((HEIGHT, WIDTH, 3), 90, np.uint8), np.full((HEIGHT, WIDTH), 255, np.uint8)])
     write_colmap(tmp_path, ("00.png",))

@@ -32,7 +32,7 @@ def picked(count: int) -> PickedFile:
 
 @pytest.fixture(scope="module")
 def cloud() -> GaussianCloud:
-    """A ball on a floor."""
+    """Return a ball on a floor."""
     return ball_on_floor()[0]
 
 

@@ -69,7 +69,7 @@ def test_each_photo_has_its_own_size(tmp_path: Path) -> None:
     assert [(camera.width, camera.height) for camera in cameras_read] == [(24, 18), (24, 18), (18, 24), (18, 24)]
     np.testing.assert_allclose([camera.fx for camera in cameras_read], 0.5 / np.tan(0.4) * np.array([24, 24, 18, 18]))
     assert [(camera.cx, camera.cy) for camera in cameras_read][2] == (9.0, 12.0)
-    # The size of a photo that is missing is known only if all have the same.
+    # The size of a missing photo is known only if all others have the same size.
     (tmp_path / "00.jpg").unlink()
     poses = read_posed_images(tmp_path)
     assert len(poses.images) == 3 and poses.excluded[0].name == "00.jpg"

@@ -26,7 +26,7 @@ OFFSET = np.array([431000.0, 5403000.0, 120.0])
 
 
 def rows(offset: np.ndarray | float = 0.0) -> list[list[str]]:
-    """Rows of RealityScan's table, from an independent decomposition of the rotation."""
+    """Return the rows of RealityScan's table, with angles from an independent decomposition of the rotation."""
     table = []
     for name, camera in zip(NAMES, cameras(), strict=True):
         to_world = camera.rotation.T @ np.diag([1.0, -1.0, -1.0])
@@ -119,7 +119,8 @@ def test_malformed_tables(text: str, expected: str, tmp_path: Path) -> None:
 
 
 def test_the_rotation_is_that_of_the_xmp_of_the_same_camera(tmp_path: Path) -> None:
-    """Both exports of one camera, published at https://forums.unrealengine.com/t/710449."""
+    """The CSV and XMP exports of one camera, published at https://forums.unrealengine.com/t/710449, have the same
+    rotation."""
     write_photos(tmp_path)
     row = rows()[0]
     row[4:7] = ["163.736597399311", "83.4154313461628", "174.386496244756"]

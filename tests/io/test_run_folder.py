@@ -115,7 +115,7 @@ def test_two_runs_at_once(tmp_path: Path) -> None:
 
 
 def test_a_broken_manifest_counts_as_a_run(tmp_path: Path) -> None:
-    """Names that point outside the folder are not followed."""
+    """Names in the manifest that point outside the folder are ignored."""
     outside = tmp_path / "secret.txt"
     outside.write_text("secret")
     folder = tmp_path / "out"
@@ -159,7 +159,7 @@ def test_remnants_of_a_killed_run_are_removed_by_the_next(tmp_path: Path) -> Non
 
 
 def test_a_run_killed_before_its_first_file_does_not_count(tmp_path: Path) -> None:
-    """Its manifest lists files, but none of them exists."""
+    """The manifest of such a run lists files, but none of them exists."""
     with run_folder(tmp_path) as run:
         run.file("a.txt")
     assert manifest(tmp_path)["files"] == {"a.txt": None}

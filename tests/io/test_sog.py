@@ -31,7 +31,8 @@ def webp(pixels: np.ndarray) -> bytes:
 
 
 def test_sog_version_1_by_hand(tmp_path: Path) -> None:
-    """Linear ranges; two Gaussians in images of 2 x 1; SH of degree 1 through a palette of 64."""
+    """The file has two Gaussians in images of 2 x 1 pixels with linear ranges, and SH of degree 1 in a palette of 64
+    entries."""
     folder = tmp_path / "old"
     folder.mkdir()
     palette = np.zeros((1, 192, 4))
@@ -79,7 +80,8 @@ def unzip(sog: Path, folder: Path) -> dict:
 
 
 def test_sog_code_book_without_first_entry(tmp_path: Path) -> None:
-    """An early writer left codebook[0] null; its value is one mean step below the second entry."""
+    """An early writer left the first entry of the code book null; it is read as one mean step below the second
+    entry."""
     cloud = make_cloud(600)
     write_sog(tmp_path / "a.sog", cloud, keep_order=True)
     meta = unzip(tmp_path / "a.sog", tmp_path / "a")

@@ -1,4 +1,4 @@
-"""Spark reads our files as egs_warp does: counts, positions, sizes, rotations, opacities and colours."""
+"""Spark reads the same counts, positions, sizes, rotations, opacities and colours from our files as egs_warp."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """PlayCanvas' splat-transform and egs_warp read each other's files alike: counts, values and the tag of antialiasing.
 
-npm fetches the tool once; the tests are skipped where it cannot. Its reader of .spz is Niantic's library, compiled by
-Adobe (``@adobe/spz``).
+npm downloads the tool once; the tests are skipped if the download fails. The tool reads .spz with Niantic's library,
+compiled by Adobe (``@adobe/spz``).
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ Convert = Callable[..., Path]
 
 @pytest.fixture(scope="module")
 def convert() -> Convert:
-    """Convert a file by splat-transform; returns the path of the result."""
+    """Return a function that converts a file by splat-transform and returns the path of the result."""
     npm = shutil.which("npm")
     if npm is None:
         pytest.skip("npm is missing")
     command = [npm, "exec", "--yes", f"--package={PACKAGE}", "--", "splat-transform", "--quiet", "--overwrite"]
     try:
-        # Fetching it takes a minute or two.
+        # The download of the tool takes a minute or two.
         subprocess.run([*command, "--version"], capture_output=True, check=True, timeout=900)
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
         pytest.skip(f"npm cannot fetch {PACKAGE}: {error}")
@@ -89,12 +89,12 @@ def test_their_files(name: str, flags: list[str], convert: Convert, tmp_path: Pa
     ours, theirs = (read_capture(one, device="cpu") for one in (path, convert(path, tmp_path / "c.ply")))
     assert_alike(ours.cloud, theirs.cloud)
     assert ours.antialiased and theirs.antialiased
-    # The tool turns a .spz, so that its up is +y; the turn is one of the axes.
+    # The tool rotates a .spz so that its up is +y. The rotation maps axes to axes, so only extents are compared.
     np.testing.assert_allclose(np.ptp(ours.means.numpy(), axis=0), np.ptp(CLOUD.means.numpy(), axis=0), atol=2e-3)
 
 
 def test_their_glb(convert: Convert, tmp_path: Path) -> None:
-    """The tool turns it about z, and does not read it."""
+    """The tool rotates a .glb by 180 degrees about z; it cannot read the format, so only its writer is tested."""
     write_ply(tmp_path / "a.ply", CLOUD)
     ours = read_capture(convert(tmp_path / "a.ply", tmp_path / "b.glb"), device="cpu")
     turned = to_body_frame(CLOUD, BodyFrame(np.diag([-1.0, -1.0, 1.0]), np.zeros(3), 1.0))

@@ -23,7 +23,7 @@ def test_a_stage_is_used_again_only_with_equal_inputs_options_and_files(tmp_path
     (out / "capture.ply").write_bytes(b"capture")
     record.finish("train", key, [out / "capture.ply"])
     assert StageRecord(out).state("train", key) is StageState.FINISHED
-    # Only the content counts, so a copy of the photos is the same input, and hidden files are none.
+    # The key depends only on the content: a copy of the photos is the same input, and hidden files are ignored.
     (tmp_path / "copy").mkdir()
     (tmp_path / "copy" / "a.png").write_bytes(b"a")
     (tmp_path / "copy" / ".cache").write_bytes(b"x")

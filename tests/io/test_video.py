@@ -67,8 +67,8 @@ def test_an_ffmpeg_that_does_not_start_leaves_nothing(tmp_path: Path, monkeypatc
 
 
 def test_a_full_disk_reported_by_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A full disk is the reason in the message, and the cause of the error decides the exit status; other messages of
-    ffmpeg are quoted unchanged."""
+    """If ffmpeg reports a full disk, the message says so, and the exit status follows from the cause of the error;
+    other messages of ffmpeg are quoted unchanged."""
     for said, number in (("[out#0] Error: No space left on device", errno.ENOSPC), ("Unknown encoder", None)):
         program = tmp_path / "ffmpeg"
         program.write_text(f"#!/bin/sh\ncat > /dev/null\necho '{said}' >&2\nexit 1\n")
@@ -110,7 +110,7 @@ def test_contact_sheet_places_frames_and_writes_labels() -> None:
 
 
 def test_a_sheet_holds_frames_of_different_sizes() -> None:
-    """Portrait and landscape side by side: each image is centred in its cell, on white."""
+    """In a sheet with portrait and landscape images, each image is centred in its cell, on white."""
     wide, tall = np.full((20, 40, 3), 7, np.uint8), np.full((60, 30, 3), 9, np.uint8)
     sheet = contact_sheet([wide, tall], 2, ["", ""])
     assert sheet.shape == (60, 80, 3)
@@ -120,7 +120,7 @@ def test_a_sheet_holds_frames_of_different_sizes() -> None:
 
 @pytest.mark.parametrize("name", ["2026-11-21T12:30", "-dash", "pipe:1", "concat:a|b", "%03d"])
 def test_a_folder_may_have_any_name(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """ffmpeg would read some names as an address, an option or a pattern."""
+    """ffmpeg could interpret such names as a URL, an option or a pattern."""
     monkeypatch.chdir(tmp_path)
     Path(name).mkdir()
     with VideoWriter(Path(name) / "v.mp4", 16, 16) as video:

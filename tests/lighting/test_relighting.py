@@ -1,4 +1,4 @@
-"""Relighting scales the colours of turned Gaussians by the ratio of irradiances, and leaves still ones as they are."""
+"""Relighting: colours of rotated Gaussians are scaled by the ratio of irradiances; others are unchanged."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LIGHT = direction(30.0, 35.0)
 
 
 def relit(ball: GaussianCloud, turn: Rotation, light: np.ndarray = LIGHT) -> np.ndarray:
-    """Return the colour coefficients (n, K, 3) of the turned ball."""
+    """Return the SH coefficients (n, K, 3) of the ball after the rotation ``turn`` and relighting."""
     form = irradiance_form(AMBIENT, 0.0, UP, 1.0 - AMBIENT, light)
     quaternion = np.tile(turn.as_quat()[[3, 0, 1, 2]], (ball.count, 1)).astype(np.float32)
     relighter = Relighter(ball, MainLight(light, 5.0, 0.3, form))
@@ -33,7 +33,8 @@ def test_normals_of_a_ball_point_outward() -> None:
 
 
 def test_a_still_creature_has_the_same_bits() -> None:
-    """Rotations within the tremor of a body at rest change no bit; larger ones change the colours continuously."""
+    """Rotations of up to 0.9 degrees, as of a body that vibrates at rest, change no bit; slightly larger ones change
+    the colours slightly."""
     ball = lit_ball(LIGHT)
     captured = ball.sh.numpy()
     for degrees in (0.0, 0.9):
@@ -56,7 +57,8 @@ def test_a_turned_ball_is_lit_from_the_same_side() -> None:
 
 
 def test_the_form_of_a_light_rotates_with_its_axes() -> None:
-    """E(R n) in rotated axes is E(n), and the form of a light is the projection onto order 2."""
+    """The rotated irradiance form at R n equals the original one at n. The form approximates ambient light plus a
+    clamped cosine to second order."""
     light = MainLight(LIGHT, 5.0, 0.3, irradiance_form(0.4, 0.1, UP, 0.6, LIGHT))
     turn = Rotation.from_euler("xyz", [0.4, -1.0, 2.0]).as_matrix()
     normals = np.random.default_rng(0).normal(size=(4000, 3))

@@ -11,8 +11,8 @@ from egs_warp.locomotion.active_set import WhitenedQp, solve_from_guess
 
 
 def random_program(seed: int) -> tuple[np.ndarray, ...]:
-    """Return P, q, A and bounds that some point satisfies; there are more rows than can be active at once, and every
-    fifth one is repeated."""
+    """Return P, q, A, lower and upper bounds of a feasible QP. There are more rows than can be active at once, and
+    every fifth general row is repeated."""
     random = np.random.default_rng(seed)
     count = int(random.integers(3, 25))
     root = random.normal(size=(count, count))
@@ -27,8 +27,8 @@ def random_program(seed: int) -> tuple[np.ndarray, ...]:
 
 @pytest.mark.parametrize("guess", ["none", "broken", "random"])
 def test_the_kkt_conditions_hold(guess: str) -> None:
-    """P x + q + A^T y = 0, x is within the bounds, multipliers have the sign of the active bound and are zero
-    elsewhere."""
+    """P x + q + A^T y = 0, A x is within the bounds, and multipliers have the sign of the active bound and are zero for
+    inactive rows."""
     for seed in range(60):
         P, q, A, lower, upper = random_program(seed)
         reduced = WhitenedQp.of(P, q, A)
@@ -65,8 +65,7 @@ def test_infeasible_bounds_are_detected() -> None:
 
 
 def test_a_sliver_between_two_bounds_has_an_optimum() -> None:
-    """A row and its duplicate, whose bounds leave an interval of a millionth that contains a feasible point: the
-    optimum is found in it."""
+    """A row and its duplicate leave an interval of 1e-6 that contains a feasible point; the optimum is found in it."""
     for seed in range(20):
         P, q, A, lower, upper = random_program(seed)
         row = len(q) + int(np.flatnonzero(np.isfinite(lower[len(q) :]))[0])
@@ -83,7 +82,7 @@ def test_a_sliver_between_two_bounds_has_an_optimum() -> None:
 
 
 def test_bounds_are_met_without_a_linear_term() -> None:
-    """For q = 0 bounds are met at any cost, also by a search that adds one row after another."""
+    """For q = 0, the solver finds a feasible point whatever its cost."""
     for seed in range(60):
         P, q, A, lower, upper = random_program(seed)
         reduced = WhitenedQp.of(P, 0.0 * q, A)
@@ -94,7 +93,7 @@ def test_bounds_are_met_without_a_linear_term() -> None:
 
 
 def test_a_minimum_within_its_bounds_is_the_optimum() -> None:
-    """No row is active, for any guess."""
+    """If the unconstrained minimum is feasible, it is returned with zero multipliers."""
     P, q, A, _, _ = random_program(3)
     reduced = WhitenedQp.of(P, q, A)
     at = A @ np.linalg.solve(P, -q)
@@ -164,7 +163,7 @@ def test_whitened_coordinates() -> None:
 
 
 def test_scaling_the_cost_scales_the_rows() -> None:
-    """Twice the Hessian shortens the rows by sqrt(2); an indefinite Hessian raises an error."""
+    """Doubling the Hessian divides the row norms by sqrt(2); an indefinite Hessian raises an error."""
     (P, q, A, *_), (Q, r, _, *_) = random_program(7), random_program(7)
     first, second = WhitenedQp.of(P, q, A), WhitenedQp.of(2.0 * Q, r + 1.0, A)
     units = second.unit_rows.copy()
@@ -178,8 +177,8 @@ def test_scaling_the_cost_scales_the_rows() -> None:
 
 
 def test_a_corner_of_nearly_dependent_rows_and_a_contradicting_row() -> None:
-    """Nearly dependent rows define a corner, and a further row is violated there by a ten-thousandth: the QP is
-    infeasible, and the search does not end in a numerical failure."""
+    """Nearly dependent rows define a corner at which a further row is violated by 1e-4: the QP is infeasible, and the
+    search does not end in a numerical failure."""
     rng = np.random.default_rng(0)
     count = 40
     A = np.eye(count) + 1e-3 * rng.standard_normal((count, count))

@@ -1,4 +1,4 @@
-"""Each bound of the audit, met and deliberately violated."""
+"""The audit: each measure is within its bound in correct runs, and exceeds it after a deliberate error."""
 
 from __future__ import annotations
 
@@ -74,7 +74,8 @@ def test_a_run_that_slides_passes() -> None:
 
 
 def test_a_missing_misplaced_or_late_push_is_detected() -> None:
-    """A blow on one side and wind; if all nodes get the same velocity instead, only the angular momentum is wrong."""
+    """The body is pushed by a blow on one side and by wind. If the blow is distributed over all nodes instead, the
+    linear momentum is still correct, but angular momentum and energy are not."""
     struck = slide(struck=True).trajectory()
     held = audit(struck)
     assert held.momentum_residual < 1e-8 and held.angular_momentum_residual < 1e-8 and held.energy_residual < 1e-9
@@ -124,13 +125,14 @@ def test_wrong_contact_velocities_are_detected() -> None:
     velocities = t.velocities.copy()
     velocities[t.contact_step[0] + 1] += [0.0, 1e-3, 0.0]
     assert audit(replace(t, velocities=velocities)).contact_velocity == pytest.approx(1e-3 / np.sqrt(9.81), rel=1e-6)
-    # A point without load may move freely.
+    # Velocities of points without load are not audited.
     forces = np.where((t.contact_step == t.contact_step[0])[:, None], 0.0, t.contact_force)
     assert audit(replace(t, velocities=velocities, contact_force=forces)).contact_velocity < 1e-12
 
 
 def test_lost_momenta_are_detected_under_contact_and_drag() -> None:
-    """Contact forces are 1 % too large; drag is twice as large; a spin of 0.01 rad/s is added without a torque."""
+    """The errors are contact forces that are 1 % too large, twice the drag, and a spin of 0.01 rad/s without a
+    torque."""
     t = slide().trajectory()
     assert audit(replace(t, contact_force=1.01 * t.contact_force)).momentum_residual > 1e-3
     assert audit(replace(t, drag=2.0 * t.drag)).momentum_residual > 1e-3
@@ -141,8 +143,7 @@ def test_lost_momenta_are_detected_under_contact_and_drag() -> None:
 
 
 def test_uneven_ground_equals_the_height_field(flight: Trajectory) -> None:
-    """The audit's own heights and normals, by SciPy's splines, are those of the height field to 1e-6, at points on
-    waves."""
+    """On waves, the audit's own heights and normals, by SciPy's splines, equal those of the height field to 1e-6."""
     field = wavy_ground(0.05)
     t = replace(
         flight,

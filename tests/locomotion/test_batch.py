@@ -1,4 +1,4 @@
-"""Many worlds in one batch: each gives the results of a single world, whatever the other worlds do."""
+"""Many worlds in one batch: each has the results of a single run, independent of the other worlds."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ FRICTIONS = (0.8, 0.3, 1.2)
 STRENGTHS = (1.0, 0.9, 0.5)
 """Factor on the recorded activations in each world."""
 FIRST, STEPS = 29, 30
-"""First step and number of steps of the recorded jump: the body leaves the ground in its 34th step and is back in its
-56th."""
+"""First step and number of steps taken from the recorded jump, in which the body takes off in the 34th step and lands
+in the 56th."""
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def jump(creature: Creature) -> Trajectory:
 def runs_alone(
     creature: Creature, starts: list[BodyState], activations: np.ndarray, dt: float
 ) -> list[list[list[StepReport]]]:
-    """Return the reports of each world and each step of ``activations`` (steps, worlds, M)."""
+    """Return the reports of each world and each step of single runs with ``activations`` (steps, worlds, M), m."""
     runs = []
     for world, (friction, state) in enumerate(zip(FRICTIONS, starts, strict=True)):
         stepper = creature.stepper.with_friction(friction)
@@ -86,7 +86,7 @@ def check(creature: Creature, one: StepReport, other: StepReport) -> None:
         (one.added_spin, other.added_spin, 1.0 / body.time_unit),
     ):
         np.testing.assert_allclose(mine, its, rtol=0, atol=1e-9 * unit)
-    # Redundant points can share a load in several ways.
+    # The distribution of a load over redundant points is not unique.
     nodal = [report.contacts.nodal_forces(report.forces) for report in (one, other)]
     np.testing.assert_allclose(*nodal, rtol=0, atol=1e-6 * body.weight)
 
@@ -111,7 +111,7 @@ def test_each_world_equals_a_single_run(creature: Creature, jump: Trajectory) ->
 
 
 def test_each_world_on_uneven_ground_equals_a_single_run(creature: Creature, jump: Trajectory) -> None:
-    """8 steps from above waves, on which the body lands and leans."""
+    """Eight steps in which the body lands on waves and tilts, in each world."""
     dt, _ = solver_steps(creature.body)
     geometry = replace(creature.geometry, field=wavy_ground(0.02 * creature.body.height, spacing=0.04, reach=1.0))
     there = replace(creature, stepper=LocomotionStepper(creature.body, creature.muscles, geometry, device="cpu"))
@@ -128,7 +128,7 @@ def test_each_world_on_uneven_ground_equals_a_single_run(creature: Creature, jum
             for one, other in zip(reports, others, strict=True):
                 check(creature, one, other)
                 slopes += np.linalg.norm(one.contacts.axes[one.forces[:, 0] > 0.0, 0, :2], axis=1).tolist()
-    # The body was carried by ground that leans in different directions.
+    # The normals of the loaded contacts have different slopes.
     assert len(slopes) > 40 and np.ptp(slopes) > 0.05
 
 
@@ -149,8 +149,8 @@ def on_its_rim(geometry: ContactGeometry, count: int = 12) -> ContactGeometry:
 
 
 def rough(creature: Creature) -> tuple[list[BodyState], np.ndarray, float]:
-    """Return start states, activations (2, 3, M) and step size of three worlds: the first and the last fall on the
-    ground with opposing muscles and too long steps, the middle one stands."""
+    """Return start states, activations (2, 3, M), m, and the step size, s, of three worlds. The bodies of the first and
+    the last one hit the ground with random muscle activations; the middle one stands. The steps are too long."""
     body, down = creature.body, creature.body.gravity / np.linalg.norm(creature.body.gravity)
     dt = 4.0 * solver_steps(body)[0]
     starts = [
@@ -203,9 +203,10 @@ def test_unconverged_steps_are_halved_as_in_single_runs(creature: Creature) -> N
 
 @pytest.mark.slow
 def test_a_world_does_not_depend_on_the_others(creature: Creature) -> None:
-    """The steps of a world do not depend on the other worlds, which stand, fall, make half steps, or fail. Equal to
-    rounding: products with other numbers of worlds and contacts round differently. The body stands on its rim, because
-    with 32 points on so coarse a base the Delassus operator is nearly singular and amplifies rounding a thousandfold.
+    """The steps of a world do not depend on the other worlds, in which bodies stand or fall, steps are halved or fail.
+    They are equal to rounding, because products with other numbers of worlds and contacts round differently. The body
+    has contact points only at its rim: with 32 points on so coarse a base, the Delassus operator is nearly singular and
+    amplifies rounding errors a thousandfold.
     """
     starts, activations, dt = rough(creature)
     geometry = on_its_rim(creature.geometry)
@@ -241,7 +242,7 @@ def test_small_chunks_change_nothing(creature: Creature) -> None:
 
 
 def test_a_world_that_cannot_be_solved_is_reported_and_removed(creature: Creature) -> None:
-    """The other worlds continue."""
+    """The report lists the world with NaN, and the other worlds continue."""
     dt, _ = solver_steps(creature.body)
     broken = replace(creature.start, velocities=np.full_like(creature.start.velocities, np.nan))
     stepper = BatchStepper(*parts(creature), FRICTIONS)

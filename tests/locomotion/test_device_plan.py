@@ -70,7 +70,8 @@ def begun(stepper: LocomotionStepper, state: BodyState, memory: WarmStart) -> St
 
 
 def on_its_edge(stepper: LocomotionStepper) -> BodyState:
-    """Return a state with few independent contacts, whose forces are not sensitive to rounding."""
+    """Return a tilted body that touches the ground with few points, so that the contact forces are not sensitive to
+    rounding."""
     turned = Rotation.from_rotvec([0.1, 0.03, 0.0]).apply(stepper.body.mesh.nodes)
     up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
     return BodyState(turned - stepper.detector.gaps(turned)[0].min() * up, np.zeros_like(turned))
@@ -108,8 +109,8 @@ def equals_host_plan(
 
 
 def test_device_plans_equal_host_plans(creature: Creature, stepper: LocomotionStepper) -> None:
-    """Step after step from rest, and in flight: a GPU records a graph in the first plan and replays it in the
-    second."""
+    """Plans are compared in consecutive steps from rest, and in flight. A GPU records a graph in the first plan and
+    replays it in the others."""
     state, memory, at_once = creature.start, stepper.initial_memory(), 0
     objectives = asks(creature, 0.1)
     for number in range(6):
@@ -129,7 +130,8 @@ def test_device_plans_equal_host_plans(creature: Creature, stepper: LocomotionSt
 def test_the_solve_continues_from_the_end_of_the_plan(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The solve makes no second request: its first Newton step is already in flight, and equals a requested one."""
+    """The plan has already queued the first Newton step, so the solve makes no further request. The step equals one
+    that is requested explicitly."""
     memory = stepper.initial_memory()
     start = begun(stepper, creature.start, memory)
     found = planner_of(stepper).plan(start, asks(creature, 0.1))
@@ -165,8 +167,8 @@ def test_the_solve_continues_from_the_end_of_the_plan(
 
 @pytest.mark.parametrize("last", [False, True])
 def test_a_replan_equals_that_of_the_host(creature: Creature, stepper: LocomotionStepper, last: bool) -> None:
-    """Replanning from the end of the ``last`` Newton step, which is the current iterate on the device, or from its
-    start. From any other point it is left to the host."""
+    """Replanning starts from the end of the last Newton step, which is the current iterate on the device, or from its
+    start. From any other point, replanning is left to the host."""
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     start = begun(stepper, on_its_edge(stepper), memory)
     found = planner_of(stepper).plan(start, objectives)
@@ -195,8 +197,8 @@ def test_a_replan_equals_that_of_the_host(creature: Creature, stepper: Locomotio
 def test_a_restart_equals_that_of_the_host(
     what: str, beside: bool, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A restart, made if the first result costs much, leads to the plan of the host, and the solve starts at its end;
-    the second search runs concurrently with the first or after it. Only after a numerical failure does the host search.
+    """If the first search has a high cost, a second search runs, concurrently or afterwards. The plan equals that of
+    the host, and the solve starts from its end. The search is left to the host only after a numerical failure.
     """
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     monkeypatch.setattr(device_plan, "PARALLEL_RESTART_COST", 0.0 if beside else np.inf)
@@ -260,8 +262,8 @@ def test_a_restart_equals_that_of_the_host(
 def test_failures_are_left_to_the_host(
     what: str, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A matrix that is not positive definite, an inverted element, or a Coulomb violation, in the prediction or at the
-    end of the search."""
+    """The failures are a matrix that is not positive definite, an inverted element, or a violation of Coulomb's law, in
+    the prediction or at the end of the search."""
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     start = begun(stepper, creature.start, memory)
     assert planner_of(stepper).plan(start, objectives) is not None
@@ -290,7 +292,7 @@ def test_a_compressed_body_is_left_to_the_host(creature: Creature, stepper: Loco
 def test_a_failed_step_is_replanned_on_the_device(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every step is replanned, with the result of the host."""
+    """The step is replanned, because the thresholds are set to zero, and its result equals that of the host."""
     monkeypatch.setattr(stepping, "_REPLAN_FACTOR", 0.0)
     monkeypatch.setattr(stepping, "_REPLAN_MARGIN", -1.0)
     planned: list[bool] = []
@@ -334,8 +336,8 @@ def test_steppers_of_one_body_share_the_workspace(creature: Creature, stepper: L
 def test_a_step_is_prefetched_once(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The next step starts when the previous one has ended. If other work runs in between, it is started again and has
-    the same result."""
+    """The plan of the next step is started as soon as a step has ended. If the stepper does other work in between, the
+    plan is started again, with the same result."""
     counted: list[StepInputs] = []
     begin = DevicePlanner.start
     monkeypatch.setattr(DevicePlanner, "start", lambda self, start: counted.append(start) or begin(self, start))

@@ -1,4 +1,4 @@
-"""The search over mode regions in one launch equals that of the host, on every device."""
+"""The search over mode regions in one kernel launch gives the result of the host, on every device."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ FRICTION = 0.6
 
 
 def body_program(seed: int, activations: int, contacts: int, *, bias: float = 0.0) -> CoulombProgram:
-    """Return the program of a random body with objectives on some of its velocities; ``bias`` presses it down."""
+    """Return the program of a random body with objectives on some of its velocities; ``bias`` is subtracted from the
+    normal velocities of all contacts."""
     rng = np.random.default_rng(seed)
     freedoms = activations + 2 * contacts + 6
     half = rng.standard_normal((freedoms, freedoms)) / np.sqrt(freedoms)
@@ -108,7 +109,7 @@ def test_at_the_limit_the_best_result_so_far_is_returned(device: str) -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_infeasible_sticking_contacts_slide(device: str) -> None:
-    """Two points at one place that must stick at different speeds have no forces within their bounds; sliding points
+    """Two points at the same place that must stick at different speeds have no feasible forces; if they may slide, they
     have."""
     counts = set()
     for seed in range(30):
@@ -147,12 +148,12 @@ def test_the_default_strategy_falls_back_to_the_host(
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("own", [-1.0, 0.0])
 def test_contacts_without_a_pivot_are_left_to_the_host(own: float, device: str) -> None:
-    """Rows are not pivoted: a contact whose own force has no effect on its velocity ends the launch; one whose force
-    has the opposite effect, as with friction coupled to other contacts, does not."""
+    """The elimination does not pivot. A contact whose force does not change its own velocity is left to the host; a
+    contact whose force has the opposite effect, as through friction that is coupled to other contacts, is not."""
     program = body_program(2, 3, 2, bias=1.0)
     speeds = program.rows[:, 3:]
     speeds[3, :] = 0.0
-    # Cancels what is added to the diagonal.
+    # The entry cancels the regularisation of the diagonal.
     speeds[3, 3] = own or -mode_region.DELASSUS_REGULARIZATION * np.abs(np.delete(np.diag(speeds), 3)).sum() / 6.0
     start = np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
     modes = ContactModes(np.full(2, STICK), np.tile([1.0, 0.0], (2, 1)))
@@ -251,7 +252,8 @@ def filled(made: Any, device: str, **shapes: Any) -> Any:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_block_iterates_as_osqp_and_ends_at_the_optimum(seed: int, device: str) -> None:
-    """For min 1/2 z^T z over rows of unit length, the same rows are guessed from any start."""
+    """For min 1/2 z^T z with constraint rows of unit length, the kernel guesses the same active rows as OSQP's
+    iterations and ends at the optimum, from any start."""
     rng, n, m = np.random.default_rng(seed), 12, 60
     units = rng.standard_normal((m, n))
     units /= np.linalg.norm(units, axis=1, keepdims=True)

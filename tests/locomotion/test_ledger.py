@@ -1,4 +1,4 @@
-"""The energy balance closes, and does not close if any of its terms or of the file's values is wrong."""
+"""The energy balance closes to rounding, but not if any of its terms or any value of the file is wrong."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.support.stances import DT
 CLOSES = 1e-6
 """Maximum residual of a step, in m g H."""
 IDLE = {"spin_after", "push_out"}
-"""Flows that the slide does not have."""
+"""Names of flows that are zero in the slide."""
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_each_flow_counts(books: EnergyBalance) -> None:
 
 @dataclass(frozen=True)
 class PartlyInside(StepProblem):
-    """Adds a fraction ``share`` of the lost spin within the step."""
+    """Step problem that restores only a fraction ``share`` of the lost spin within the step."""
 
     share: float = 0.0
 
@@ -66,7 +66,8 @@ class PartlyInside(StepProblem):
 
 @pytest.mark.parametrize("share", [0.0, 0.6])
 def test_spin_added_after_a_step_counts(trajectory: Trajectory, share: float) -> None:
-    """A block spins in the air; the rest of the spin that implicit Euler loses is added at the end of its step."""
+    """A block spins in the air. Of the spin that implicit Euler loses, a part is restored within the step and the rest
+    at its end."""
     body, positions = slide().stepper.body, trajectory.positions[0]
     state = BodyState(positions, np.cross([3.0, -2.0, 5.0], positions - body.centre_of_mass(positions)))
     problem = PartlyInside(body, state, DT, trajectory.drag, share)
@@ -105,7 +106,8 @@ def one_step(
 
 @pytest.mark.parametrize("height", [0.65, 0.5, 0.32])
 def test_muscles_that_lose_their_tension_count(trajectory: Trajectory, height: float) -> None:
-    """A block is compressed so that segments pass 0.7 or 0.3 of their rest length, or begin between these."""
+    """A block is compressed so that muscle segments become shorter than 0.7 or 0.3 of their rest length, between which
+    the tension depends on the length."""
     stepper = slide().stepper
     body, muscles = stepper.body, stepper.muscles
     positions = body.mesh.nodes * [1.0, 1.0, height] + [0.0, 0.0, 1.0]
@@ -179,7 +181,7 @@ def test_an_error_in_any_stored_value_is_detected(trajectory: Trajectory, number
 
 
 def test_inconsistent_velocities_are_detected(trajectory: Trajectory) -> None:
-    """An expansion at 0.1 / s, which has no momentum, is not mistaken for added spin."""
+    """An added expansion at 0.1 / s has no momentum; the balance does not count it as added spin and fails to close."""
     velocities = trajectory.velocities.copy()
     middle = trajectory.positions[10] - trajectory.node_mass @ trajectory.positions[10] / trajectory.node_mass.sum()
     velocities[10] += 0.1 * middle
@@ -187,8 +189,8 @@ def test_inconsistent_velocities_are_detected(trajectory: Trajectory) -> None:
 
 
 def test_signs_are_those_of_physics(books: EnergyBalance) -> None:
-    """Damping, drag, friction and the inertia loss of implicit Euler never add energy, except for the residual of the
-    contact solver."""
+    """Damping, drag, friction, contact and the inertia loss of implicit Euler do not add energy beyond the residual of
+    the contact solver."""
     for flow in ("damping", "drag", "friction", "contact", "lost_inertia"):
         assert (getattr(books, flow) <= 1e-8 * books.energy_unit).all(), flow
     assert (books.push_out >= 0.0).all() and (books.muscle_work >= books.muscles - 1e-12 * books.energy_unit).all()
@@ -203,8 +205,8 @@ def test_stored_energies_are_those_of_the_body(trajectory: Trajectory, books: En
 
 @pytest.mark.parametrize("crushed", [0.5, 0.02, 1e-4])
 def test_the_loss_of_a_step_is_exact_for_crushed_elements(crushed: float) -> None:
-    """Psi(F0) - Psi(F1) + P(F1) : (F1 - F0), with energy and stress of one element written out (Eq. 5), even if the
-    straight path between the two states would invert it."""
+    """The loss is Psi(F0) - Psi(F1) + P(F1) : (F1 - F0), with energy and stress of one element written out (Eq. 5),
+    even if the straight path between the two states would invert the element."""
     mu, lam = 3.0, 7.0
     element = module._Elements(np.zeros((1, 4), int), np.eye(3)[None], np.ones(1), mu, lam, 0.0)
     turn = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -241,8 +243,7 @@ def imported(path: Path) -> set[str]:
 
 
 def test_the_work_of_a_shortened_muscle_is_an_integral() -> None:
-    """The energy balance has its own formula; it equals the midpoint rule over lengths from zero to 1.2 rest
-    lengths."""
+    """The closed form of the energy balance equals the midpoint rule, for lengths from zero to 1.2 rest lengths."""
     count, rest = 4800, 0.5
     lengths = 1.2 * rest * np.arange(count + 1) / count
     middles = 0.5 * (lengths[1:] + lengths[:-1]) / rest

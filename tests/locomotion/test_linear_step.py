@@ -38,7 +38,7 @@ def about_a_fall(stepper: LocomotionStepper, creature: Creature, seed: int = 0) 
 
 
 def test_the_end_is_that_of_the_newton_step(creature: Creature) -> None:
-    """Activations and contact forces act on the nodes, and the tangent gives the change of the velocities (Eq. 7,
+    """The linear step equals the solution of the tangent for the nodal forces of activations and contacts (Eq. 7,
     8)."""
     stepper = creature.stepper
     prospect, linear = about_a_fall(stepper, creature)
@@ -82,7 +82,8 @@ def test_objective_values_are_squared_errors(creature: Creature) -> None:
 def test_the_device_step_equals_that_of_the_host(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """For one prediction after another: a GPU records a graph in the first step and replays it in the second."""
+    """Several predictions are compared, because a GPU records a graph in the first step and replays it in the
+    others."""
     pytest.importorskip("torch")
     expected = [about_a_fall(creature.stepper, creature, seed)[1] for seed in range(3)]
     stepper = on_device(creature, device, monkeypatch)

@@ -43,19 +43,20 @@ by_frame = pytest.mark.parametrize("frame", FRAMES, ids=["world", "turned", "cen
 
 
 def shaken_state(seed: int = 3) -> BodyState:
-    """A bent body in motion."""
+    """Return the state of a bent body in motion."""
     rng = np.random.default_rng(seed)
     nodes = BODY.mesh.nodes
     return BodyState(nodes + 0.02 * rng.standard_normal(nodes.shape), rng.standard_normal(nodes.shape))
 
 
 def rate_of(quantity: Callable[[np.ndarray], Any], state: BodyState, velocities: np.ndarray) -> np.ndarray:
-    """d quantity(positions) / dt by a central difference along ``velocities`` (N, 3)."""
+    """Return the time derivative of ``quantity`` of the positions by a central difference along ``velocities`` (N, 3),
+    m/s."""
     return (quantity(state.positions + NEAR * velocities) - quantity(state.positions - NEAR * velocities)) / (2 * NEAR)
 
 
 def test_centre_of_mass_rows_are_the_rate_of_the_centre_of_mass() -> None:
-    """The rows are v = d(com)/dt, by a difference of positions along v."""
+    """The rows give the time derivative of the centre of mass, by a central difference along v."""
     rng = np.random.default_rng(0)
     x, v, h = BODY.mesh.nodes, rng.standard_normal(BODY.mesh.nodes.shape), 1e-3
     objective = centre_of_mass_velocity(BODY, np.array([1.0, 2.0, 3.0]), 0.7)
@@ -80,8 +81,8 @@ def test_node_rows_measure_the_mass_weighted_distance_from_the_target() -> None:
 
 
 def test_strain_rows_measure_only_uniform_strain() -> None:
-    """For an affine motion, the mean square of its non-rigid part; zero for a rigid motion and for one without uniform
-    strain."""
+    """The objective of an affine motion is the mean square velocity of its non-rigid part; a rigid motion and a motion
+    without uniform strain give zero."""
     rng = np.random.default_rng(4)
     state = shaken_state()
     target = rng.standard_normal(state.positions.shape)
@@ -102,7 +103,7 @@ def test_strain_rows_measure_only_uniform_strain() -> None:
     strained = affine - np.cross(spin, arms)
     assert square(affine + rigid) == pytest.approx((mass * strained**2).sum(), rel=1e-10)
     assert np.allclose(objective.target, objective.rows @ target.ravel())
-    # A motion orthogonal to all affine ones, weighted by mass, does not count.
+    # A motion that is orthogonal to all affine ones in the mass inner product gives zero.
     modes = np.eye(9).reshape(9, 3, 3)
     spanned = np.stack([(arms @ mode).ravel() for mode in modes] + [np.tile(a, len(arms)) for a in np.eye(3)], axis=1)
     weight = np.repeat(mass.ravel(), 3)
@@ -119,8 +120,8 @@ def place(part: BodyPart, frame: Coordinates, positions: np.ndarray) -> np.ndarr
 @by_part
 @by_frame
 def test_part_rows_are_the_rate_of_the_part_s_centre(part: BodyPart, frame: Coordinates) -> None:
-    """Velocity, position and acceleration of a part: rows by finite differences; a velocity that meets the target gives
-    the requested motion."""
+    """Rows of velocity, position and acceleration objectives equal finite differences; velocities that meet their
+    targets give the requested motion."""
     state, dt = shaken_state(), 0.01
     v = np.random.default_rng(4).standard_normal(state.positions.shape)
     rate = rate_of(lambda x: place(part, frame, x), state, v)
@@ -139,8 +140,8 @@ def test_part_rows_are_the_rate_of_the_part_s_centre(part: BodyPart, frame: Coor
 @by_part
 @by_frame
 def test_momentum_rows_measure_the_angular_momentum(part: BodyPart, frame: Coordinates) -> None:
-    """Sum of m (x - c) x (v - v_c) over the part, about its own centre or that of the body, scaled to m/s; a rigid
-    rotation gives inertia x omega.
+    """The rows give the sum of m (x - c) x (v - v_c) over the part, about its own centre or that of the body, scaled to
+    m/s; a rigid rotation gives the inertia times omega.
     """
     state = shaken_state()
     v = np.random.default_rng(5).standard_normal(state.positions.shape)
@@ -158,7 +159,8 @@ def test_momentum_rows_measure_the_angular_momentum(part: BodyPart, frame: Coord
 
 @by_part
 def test_rotation_rows_are_the_rate_of_the_best_fit_rotation(part: BodyPart) -> None:
-    """In a rigid velocity field, the rows give the angular velocity of the part's rotation by Kabsch's method."""
+    """In a rigid velocity field, the rows give the rate of the part's best-fit rotation (Kabsch), which is the angular
+    velocity."""
     state = shaken_state()
     turn = np.array([0.4, -0.2, 0.7])
     rigid = np.cross(turn, state.positions) + [1.0, 2.0, 3.0]
@@ -191,7 +193,8 @@ def test_area_rows_are_the_rate_of_the_area_of_the_base() -> None:
 
 
 def test_slip_costs_its_square_times_the_load() -> None:
-    """The contact plane is sloped, so that slip is not along an axis; motion along the normal costs nothing."""
+    """The squared error is the load times the squared slip, on a sloped contact plane. Motion along the normal does not
+    contribute."""
     floor = Plane(np.array([0.1, -0.2, 1.0]) / np.sqrt(1.05), 0.3)
     nodes = BODY.mesh.nodes
     embedding = embed_points(BODY.mesh, nodes[nodes[:, 2] == 0.0], device="cpu")

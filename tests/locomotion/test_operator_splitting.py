@@ -17,7 +17,7 @@ SIZES = (3, 8, 9, 30)
 
 
 def program(seed: int, rows: int, unknowns: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows of length 1, bounds that the minimum violates but another point satisfies, and a start."""
+    """Return unit-length rows, bounds that are feasible but violated by the unconstrained minimum, and a start."""
     rng = np.random.default_rng(seed)
     units = rng.standard_normal((rows, unknowns))
     units /= np.linalg.norm(units, axis=1)[:, None]

@@ -1,5 +1,5 @@
-"""A run is written to disk while it proceeds: parts of a killed run can be read, and a complete run gives the same
-trajectory either way."""
+"""A run is written to disk while it proceeds: the parts of a killed run can be read, and the parts of a complete run
+give the same trajectory as the records in memory."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_all_that_acts_on_the_body_is_written_down() -> None:
 
 
 def test_each_contact_names_its_plane_among_parallel_ones() -> None:
-    """One half of a block is lifted over a step: treads have one normal, risers another."""
+    """One half of a block stands above a step, so that two of the planes, floor and tread, have the same normal."""
     run = slide()
     body, flat = run.stepper.body, run.stepper.geometry
     step = (Plane(np.array([0.0, 0.0, 1.0]), -0.2), Plane(np.array([-1.0, 0.0, 0.0]), 0.05))

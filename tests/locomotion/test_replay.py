@@ -27,7 +27,7 @@ from tests.support.slides import slide
 from tests.support.stances import FORWARD
 
 FRAMES, CUT = 36, 28
-"""Number of frames, and the step at which the run is interrupted, during the thrust of the block."""
+"""Number of frames of the run, and the step, during the thrust, at which it is interrupted."""
 
 
 class KilledError(Exception):
@@ -92,7 +92,7 @@ def same_steps(one: tuple[StepReport, ...], other: tuple[StepReport, ...]) -> bo
 def test_a_run_continues_to_the_same_bits(
     script: str, cut_off: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A new body solves only the steps that were not recorded."""
+    """The resumed run solves only the steps that were not recorded."""
     body, folder = BODIES[script], cut_off
     whole = uninterrupted() if script == "jump" else run(body(), script)
     if script != "jump":
@@ -123,7 +123,8 @@ def test_a_run_continues_to_the_same_bits(
 
 @pytest.mark.slow
 def test_a_run_continues_from_any_of_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The run is interrupted after each step: all state that persists between steps is recorded."""
+    """The run is interrupted after each step and has the same bits, so all state that persists between steps is
+    recorded."""
     monkeypatch.setattr("egs_warp.locomotion.recorder._MIN_STEPS_PER_PART", 1)
     whole = run(block(), parts=lambda: tmp_path / "whole")
     parts = sorted(path.name for path in (tmp_path / "whole").iterdir())
@@ -199,7 +200,7 @@ def test_a_pushed_run_continues_and_another_push_is_refused(tmp_path: Path) -> N
 
 
 def test_a_full_disk_while_a_part_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """There is a one-line error; earlier parts stay, and the run continues from them."""
+    """The error is one line; earlier parts remain on disk, and the run can be continued from them."""
     replace = os.replace
     for number in (0, 2):
         parts, calls = tmp_path / str(number), iter(range(100))

@@ -77,7 +77,8 @@ def test_a_divided_step_passes_on_its_last_part(creature: CoarseCreature, monkey
 
 @pytest.mark.parametrize("before", [[], [True] * 5 + [False]], ids=["at once", "and goes on"])
 def test_a_finished_motion_rests_before_it_ends(creature: CoarseCreature, before: list[bool]) -> None:
-    """``REST_FRAMES`` frames in a row: a motion that continues in between resets the count."""
+    """The run ends after ``REST_FRAMES`` consecutive frames in which the motion is finished; a frame in which it is not
+    resets the count."""
     frames = iter(before + [True] * 100)
     nothing = np.zeros((100, creature.stepper.muscles.segment_count))
     done = roll_out(
@@ -94,7 +95,7 @@ def test_a_finished_motion_rests_before_it_ends(creature: CoarseCreature, before
 
 @pytest.mark.slow
 def test_steps_that_have_no_solution(creature: CoarseCreature) -> None:
-    """Steps without a solution are found at the start: NaN, and values too large for double precision."""
+    """A start state with NaN, or with values too large for double precision, stops the run before the first step."""
     still, positions = np.zeros_like(creature.start.velocities), creature.start.positions
     for start in (
         BodyState(positions, still * np.nan),
@@ -109,8 +110,8 @@ def test_steps_that_have_no_solution(creature: CoarseCreature) -> None:
 def test_a_body_that_stands_still_is_settled_in_few_steps(
     creature: CoarseCreature, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The search ends where another long step would move the body by less than 2e-4 of its height, with its weight
-    carried, before the last of twelve steps.
+    """Settling ends before its limit of twelve steps, when a further long step would move the body by less than 2e-4 of
+    its height and the contact forces equal its weight to 1 %.
     """
     steps, passive = [], LocomotionStepper.passive_step
     monkeypatch.setattr(LocomotionStepper, "passive_step", lambda *given: steps.append(1) or passive(*given))
@@ -122,8 +123,8 @@ def test_a_body_that_stands_still_is_settled_in_few_steps(
 
 
 def test_a_body_over_no_ground_is_not_followed_down(creature: CoarseCreature) -> None:
-    """Each step of sqrt(H / g) / 4 starts without velocity and lets it fall by g dt^2 = H / 16: after two steps its
-    centre has moved by more than 0.1 H, and the body is returned."""
+    """Each step of dt = sqrt(H / g) / 4 starts without velocity, so the body falls by g dt^2 = H / 16. Settling ends
+    after two steps, because the centre of mass has then moved by more than 0.1 H."""
     body, geometry = creature.stepper.body, creature.stepper.geometry
     (floor,) = geometry.planes
     below = replace(geometry, planes=(replace(floor, offset=floor.offset + 100.0),))
@@ -133,7 +134,7 @@ def test_a_body_over_no_ground_is_not_followed_down(creature: CoarseCreature) ->
 
 
 def test_zero_frames(creature: CoarseCreature) -> None:
-    """As with activations for less than a frame: the start is the only state, and no step failed."""
+    """The start is the only state, and the run does not count as stopped."""
     sequence = MotionSequence(creature.place, motion("jump").parts(creature.place.body.height))
     done = roll_out(creature.stepper, creature.stepper.geometry, creature.start, sequence, frames=0)
     assert not done.stopped and done.reports == () and done.frames.tolist() == [0]

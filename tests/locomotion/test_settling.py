@@ -1,4 +1,4 @@
-"""A body rests in its captured shape: its unloaded shape differs from that by what its weight deforms."""
+"""A body rests in its captured shape: the unloaded shape is chosen so that the weight deforms it into that shape."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.support.stances import FORWARD
 
 @pytest.fixture(scope="module")
 def soft_column() -> CoarseCreature:
-    """A column that leans by 0.2 of its height, and is twice as soft as the default."""
+    """Create a column that leans by 0.2 of its height and is twice as soft as the default."""
     mesh = box_mesh((2, 2, 4), (0.5, 0.5, 1.0))
     mesh.nodes[:, 0] += 0.2 * mesh.nodes[:, 2]
     return coarse_creature(mesh, forward=FORWARD, sag=0.1, settle_first=False)
@@ -32,7 +32,8 @@ def test_the_resting_body_has_the_captured_shape(soft_column: CoarseCreature) ->
 
 
 def test_the_forces_on_the_captured_shape_balance(soft_column: CoarseCreature) -> None:
-    """Above the base, the elastic force carries the weight of each node; at the base, contact carries the body's."""
+    """Elastic force and weight balance at each node above the base; the sum over all nodes is the weight of the body,
+    which the contact carries at the base."""
     stepper, start, _ = settle_as_captured(soft_column.stepper, settle(soft_column.stepper))
     body = stepper.body
     force = -body.assembly.gradient(start.positions) + body.node_mass[:, None] * body.gravity
@@ -43,7 +44,8 @@ def test_the_forces_on_the_captured_shape_balance(soft_column: CoarseCreature) -
 
 
 def test_anderson_acceleration_solves_a_diverging_linear_iteration() -> None:
-    """x <- x - A x diverges for eigenvalues of A above 2; two unknowns take three iterates."""
+    """The iteration x <- x - A x diverges because A has an eigenvalue above 2; with acceleration, a problem of two
+    unknowns is solved in three iterations."""
     matrix = np.array([[3.0, 0.4], [0.1, 0.5]])
     points = [np.array([[1.0, 1.0]])]
     residuals = [points[0] @ matrix.T]

@@ -135,7 +135,8 @@ def test_infeasible_bounds_are_reported_and_the_next_solve_recovers(solver: QpSo
 
 @SOLVERS
 def test_repeated_rows_may_all_be_active(solver: QpSolver, accuracy: float) -> None:
-    """A static contact has n_d equality rows of rank two; equality rows that agree are no contradiction."""
+    """A sticking contact has n_d equality rows of rank two. Linearly dependent equality rows that agree have a
+    solution."""
     P, q, A = random_program(4)
     A = np.vstack([A[:4], A[:4], A[0] + A[1]])
     solution = quadratic_program(P, q, A, solver=solver).solve(np.zeros(9), np.zeros(9))
@@ -144,8 +145,8 @@ def test_repeated_rows_may_all_be_active(solver: QpSolver, accuracy: float) -> N
 
 
 def test_an_iteration_limit_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the limit the point is usable if it nearly satisfies the bounds; a point that does not has a wrong, low
-    objective.
+    """At the iteration limit, the point is usable if it nearly satisfies the bounds; otherwise it would have a wrong,
+    low objective and is discarded.
     """
     P, q, A = random_program(0)
     program = quadratic_program(P, q, A, accuracy=1e-30)
@@ -159,7 +160,8 @@ def test_an_iteration_limit_is_reported(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_program_whose_bounds_are_all_slack(capfd: pytest.CaptureFixture[str]) -> None:
-    """As in flight: the unconstrained minimum to rounding, without output of the solver."""
+    """The result is the unconstrained minimum to rounding, without output of the solver. Programs in flight have such
+    bounds."""
     P, q, A = random_program(1)
     solution = quadratic_program(P, q, A).solve(np.full(30, -1e3), np.full(30, 1e3))
     assert solution.status is QpStatus.SOLVED and np.abs(P @ solution.x + q).max() < 1e-9

@@ -61,8 +61,8 @@ def test_objectives_are_weighted_squared_errors() -> None:
 
 
 def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, time: float, x: np.ndarray) -> np.ndarray:
-    """Return the positions (N, 3) of the body ``time`` s after the step, if it continued as one implicit step from
-    there."""
+    """Return the positions (N, 3), m, of the body ``time`` s after the start of the step, if it continued from the end
+    of the step with one implicit step."""
     end = problem.end_positions(foreseen.reshape(-1, 3))
     entries = BODY.assembly.hessian_entries(
         end, BODY.assembly.damping(problem.state.positions, time), factor=time**2, projected=True
@@ -75,7 +75,8 @@ def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, tim
 
 
 def test_effort_is_the_future_energy_and_convex() -> None:
-    """Value, gradient and curvature about the predicted end, by finite differences of the energy."""
+    """Value and gradient of the effort equal those of the energy at the future positions, by finite differences; the
+    model is convex and accurate near the predicted end."""
     problem, linear, foreseen = example()
     horizon = 0.16
     time = horizon * np.sqrt(BODY.height / 9.81)
@@ -105,8 +106,9 @@ def test_effort_is_the_future_energy_and_convex() -> None:
 
 
 def test_a_relaxing_body_is_predicted_without_reversed_strain() -> None:
-    """A stretched body reaches its rest shape within the step at its end velocity; at the same speed afterwards it
-    would be strained by twice as much."""
+    """A stretched body reaches its rest shape at the end of the step. At constant velocity it would be compressed by
+    twice the stretch at the end of the horizon of three steps; the predicted effort is less than half of that
+    energy."""
     nodes = BODY.mesh.nodes
     stretch = 0.02 * (nodes - nodes.mean(axis=0)) * [0.0, 0.0, 1.0]
     problem = StepProblem(BODY, BodyState(nodes + stretch, np.zeros_like(nodes)), DT)

@@ -1,5 +1,5 @@
-"""The stepper (Eq. 4, 9, 12, 13): each step audited by hand, deterministic runs, a body that follows its objectives,
-subdivision of a failed step."""
+"""The stepper (Eq. 4, 9, 12, 13): an independent audit of each step, deterministic runs, a body that follows its
+objectives, and subdivision of a failed step."""
 
 from __future__ import annotations
 
@@ -43,7 +43,8 @@ GRID = np.array([[x, y] for x in SIDE for y in SIDE])
 def muscular_block(
     device: str = "cpu", *, feet: np.ndarray = GRID, settings: LocomotionSettings | None = None
 ) -> LocomotionStepper:
-    """A block with eight longitudinal and six radial fibres and contact points ``feet`` (n, 2) under its base."""
+    """Create a block with eight longitudinal and six radial fibres and contact points ``feet`` (n, 2), m, on its
+    base."""
     mesh = block_mesh()
     body = make_body(mesh, FLOOR, sag=0.03, device=device)
     heights = np.array([0.02, 0.26, 0.5, 0.74, 0.98])
@@ -62,7 +63,7 @@ def muscular_block(
 
 
 def hop(body: SoftBody, step: int) -> list[AnyObjective]:
-    """Return objectives of a hop: down for six steps, then up and forwards, upright."""
+    """Return the objectives of a hop: the body is upright and moves down for six steps, then up and forwards."""
     velocity = np.array([0.0, 0.0, -0.4]) if step < 6 else np.array([0.1, 0.0, 0.25 * (step - 5)])
     pose = np.tile(velocity, (len(body.mesh.nodes), 1))
     return [
@@ -85,8 +86,8 @@ def run_hop(stepper: LocomotionStepper, steps: int) -> tuple[list[BodyState], li
 
 
 def test_audit_of_a_hop(device: str) -> None:
-    """Eq. (4), Eq. (9), Eq. (12), Eq. (13): linear momentum to 1e-5, angular momentum to 1e-4, cone to 1e-4,
-    complementarity to 1e-4, penetration to 0.01.
+    """Eq. (4), Eq. (9), Eq. (12), Eq. (13): in units of weight and height, the linear momentum balance holds to 1e-5,
+    the angular one, the friction cone and complementarity hold to 1e-4, and the penetration is at most 0.01.
     """
     stepper = muscular_block(device)
     body = stepper.body
@@ -144,8 +145,8 @@ def test_predictions_of_a_program_are_in_its_units() -> None:
 
 
 def test_a_body_bobs_as_requested() -> None:
-    """Half a period with an amplitude of 2 % of the height: the velocity of the centre of mass is within 5 % of its
-    peak, and the load does not reverse."""
+    """In half a period of a vertical oscillation with an amplitude of 2 % of the height, the error of the velocity is
+    less than 5 % of its peak, and the change of the load reverses its sign in at most 15 % of the steps."""
     creature = coarse_creature(block_mesh(), forward=np.array([1.0, 0.0, 0.0]))
     stepper, body, state = creature.stepper, creature.stepper.body, creature.start
     memory, loads, misses = stepper.initial_memory(), [], []
@@ -172,8 +173,8 @@ def test_a_body_bobs_as_requested() -> None:
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 def test_device_factors_give_the_same_hop(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """30 steps in closed loop (10 on a CPU, where dense factors are slow), each with its own activations: within 1e-8 H
-    of sparse factors. The body stands on four feet; with more, rounding decides which points carry the load.
+    """In 30 planned steps (10 on a CPU, where dense factors are slow), positions differ by less than 1e-8 H from those
+    with sparse factors. The body has four contact points; with more, rounding decides which of them carry the load.
     """
     steps, corners = 10 if device == "cpu" else 30, GRID[[0, 4, 20, 24]]
     dense_factors = pytest.importorskip("egs_warp.fem.tiled_cholesky")
@@ -216,7 +217,8 @@ def test_two_runs_are_bit_identical() -> None:
     ids=["line", "duplicates", "one point", "forty points"],
 )
 def test_degenerate_contact_sets_never_lose_a_frame(feet: np.ndarray, solver: QpSolver) -> None:
-    """Eq. (9), Eq. (13): every step converges, finds feasible states and keeps its points out of the ground."""
+    """Eq. (9), Eq. (13): every step converges, all its QPs are feasible, and no point penetrates by more than 1 % of
+    the height."""
     stepper = muscular_block(feet=feet, settings=LocomotionSettings(qp_solver=solver))
     _, reports = run_hop(stepper, 8)
     assert len(reports) == 8
@@ -229,7 +231,8 @@ def test_degenerate_contact_sets_never_lose_a_frame(feet: np.ndarray, solver: Qp
 
 @pytest.mark.parametrize("strategy", list(Strategy))
 def test_the_stepper_runs_with_every_strategy(strategy: Strategy) -> None:
-    """Eq. (12), Eq. (13): the same steps with another search."""
+    """Eq. (12), Eq. (13): with every search, all steps converge, muscles are active, and the number of QPs is
+    bounded."""
     settings = LocomotionSettings(strategy=strategy, qp_limit=6, qp_solver=QpSolver.DAQP)
     _, reports = run_hop(muscular_block(settings=settings), 6)
     assert all(report.converged for report in reports)
@@ -238,7 +241,7 @@ def test_the_stepper_runs_with_every_strategy(strategy: Strategy) -> None:
 
 
 class LateStepper(LocomotionStepper):
-    """Reports that every step longer than ``longest`` did not converge."""
+    """Stepper that reports every step longer than ``longest`` as not converged."""
 
     longest = 0.0
 
@@ -276,8 +279,8 @@ def test_a_step_that_does_not_converge_is_subdivided(longest: float, parts: int)
 
 @pytest.mark.parametrize("planned_well", [True, False])
 def test_half_steps_use_the_better_activations(planned_well: bool) -> None:
-    """The planned activations of a step that does not converge, or the previous ones if the planned ones push the wrong
-    way."""
+    """The half steps of a step that does not converge use the planned or the previous activations, whichever give the
+    lower objective."""
     made = muscular_block()
     start = BodyState(made.body.mesh.nodes, np.zeros_like(made.body.mesh.nodes))
     with one_blas_thread():

@@ -35,7 +35,7 @@ def test_similar_muscles_are_grouped_and_small_sets_are_not() -> None:
     expected = [values[found.group_from_muscle == g].mean() for g in range(5)]
     assert np.allclose(found.mean(values), expected)
     assert np.array_equal(found.members @ np.arange(5.0), found.group_from_muscle)
-    # As many as the cage has nodes for: 0.32 of their number, between 80 and 120.
+    # The maximum number of groups is 0.32 times the number of nodes, limited to 80 to 120.
     for nodes, most in ((100, 80), (250, 80), (300, 96), (2000, 120)):
         many = replace(muscles, segments=np.tile(muscles.segments, (1 + 150 // count, 1)))
         made = random.standard_normal((3 * nodes, many.segment_count))
@@ -45,8 +45,8 @@ def test_similar_muscles_are_grouped_and_small_sets_are_not() -> None:
 
 
 def test_muscles_are_grouped_by_their_effect_in_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Effects are velocity changes in a step of sqrt(H / g) / 19: their impulse, by central differences of the equation
-    of that step, is parallel to that of the muscle."""
+    """The effect of a muscle is its velocity change in a step of sqrt(H / g) / 19. The impulse of this change, by
+    central differences of the equation of the step, is parallel to the impulse of the muscle."""
     given = []
     monkeypatch.setattr(module, "find_synergies", lambda *rest: given.append(rest) or find_synergies(*rest))
     stepper = coarse_creature(block_mesh(), forward=FORWARD, settle_first=False).stepper

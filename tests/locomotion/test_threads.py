@@ -16,7 +16,7 @@ def _threads() -> set[int]:
 
 
 def test_a_step_uses_one_blas_thread_and_restores_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For any number of threads set by the calling program."""
+    """A step sets the number of BLAS threads to one, whatever number the calling program has set, and restores it."""
     pawn, seen = coarse_pawn(), []
     step = LocomotionStepper.step
 

@@ -30,8 +30,8 @@ def test_ballistic_flight_is_measured(flight: Trajectory) -> None:
 
 
 def test_a_part_of_a_trajectory_is_measured_separately(flight: Trajectory) -> None:
-    """From the third to the tenth state, all in the air, the measures are those of a trajectory that begins and ends
-    there."""
+    """Measures from the third to the tenth state, all in the air, equal those of a trajectory with only these
+    states."""
     cut = replace(
         flight,
         **{name: getattr(flight, name)[3:11] for name in ("time", "positions", "velocities", "min_gap")},
@@ -44,7 +44,7 @@ def test_a_part_of_a_trajectory_is_measured_separately(flight: Trajectory) -> No
 
 
 def test_measures_do_not_depend_on_the_up_axis(flight: Trajectory) -> None:
-    """The whole world is rotated: distance, height, heading, tilt and time in the air stay the same."""
+    """If the whole world is rotated, distance, height, heading, tilt and time in the air stay the same."""
     expected = measure(flight)
     for vector in ([0.5 * np.pi, 0.0, 0.0], [0.0, 0.5 * np.pi, 0.0], [0.4, -1.1, 0.7]):
         turn = Rotation.from_rotvec(vector).as_matrix()

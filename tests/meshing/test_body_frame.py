@@ -1,4 +1,4 @@
-"""Cage and frame depend only on the body, not on the order, unit, position and axes of the file."""
+"""Cage and body frame are independent of the order, unit, position and axes of the file."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def body_cage(lying: Lying) -> tuple[BodyFrame, Cage]:
 
 @pytest.fixture(scope="module", params=["pawn", pytest.param("stool", marks=pytest.mark.slow)])
 def thing(request: pytest.FixtureRequest) -> Lying:
-    """Return a round body or one with a front, coarse."""
+    """Return a coarse pawn, which is round, or a coarse stool, which has a front."""
     made = {"pawn": pawn, "stool": stool}[request.param](gaussian_count=3000)
     return Lying(made.cloud, made.plane).on_grid()
 
@@ -73,7 +73,7 @@ def test_same_bits_for_any_frame_of_the_file(thing: Lying, its_cage: Cage, other
     ids=["both", "x0.37", "turned"],
 )
 def test_same_cage_in_any_unit_and_orientation(thing: Lying, its_cage: Cage, other: Callable[[Lying], Lying]) -> None:
-    """The tetrahedra are the same, and the nodes are equal within 1e-5 of the height, the effect of rounding."""
+    """The tetrahedra are the same, and the nodes differ by less than 1e-5 of the height because of rounding."""
     _, cage = body_cage(other(thing))
     assert np.array_equal(cage.mesh.tets, its_cage.mesh.tets)
     assert np.abs(cage.mesh.nodes - its_cage.mesh.nodes).max() < 1e-5 * its_cage.height(GROUND)
@@ -115,13 +115,14 @@ def test_the_frame_transforms_with_the_body(seed: int, scale: float, angle: floa
     plane = GROUND.scaled(scale).moved(np.array(shift))
     other = scale * points @ turn.T + shift
     seen = upright_frame(other, weights, plane).points(other)
-    # Rounding may choose among nearly equal moments; none of 200 random points are so close.
+    # With nearly equal moments, rounding could decide the axes; sets of 200 random points have no such moments.
     assert np.abs(seen - frame.points(points)).max() < 1e-6 * np.abs(seen).max()
 
 
 @pytest.mark.parametrize("sides", [3, 4, 5])
 def test_round_bodies_face_along_their_longest_directions(sides: int) -> None:
-    """A regular star has no long side: x passes through one of its tips, or between two, and rotates with it."""
+    """A regular star has no long side. Its x axis passes through one of its tips, or between two, and rotates with the
+    star."""
     random = np.random.default_rng(sides)
     azimuth = 2.0 * np.pi * np.repeat(np.arange(sides), 50) / sides + np.tile(random.normal(0.0, 0.1, 50), sides)
     radius = np.tile(random.uniform(0.2, 1.0, 50), sides)
@@ -156,7 +157,7 @@ def test_corners_do_not_outweigh_a_long_side() -> None:
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_long_body_faces_along_its_length_towards_its_tail(way: float) -> None:
-    """The body is denser at the opposite end, so the tail dominates the third moments about its centre."""
+    """The body is denser at the end opposite to the tail, so the tail dominates the third moments about the centre."""
     along = way * np.linspace(0.0, 1.0, 201) ** 1.5
     aside = np.resize([0.05, -0.05], 201)
     points = np.column_stack([0.6 * along - 0.8 * aside, 0.8 * along + 0.6 * aside, np.full(201, 0.3)])
@@ -165,7 +166,7 @@ def test_a_long_body_faces_along_its_length_towards_its_tail(way: float) -> None
 
 
 def test_the_origin_is_under_the_centre_and_the_unit_is_the_median_distance() -> None:
-    """Points on a sphere, above a plane that is not level."""
+    """The points are on a sphere above a tilted plane."""
     random = np.random.default_rng(0)
     half = random.normal(size=(500, 3))
     points = 2.0 * np.concatenate([half, -half]) / np.linalg.norm(np.concatenate([half, half]), axis=1)[:, None]
@@ -203,8 +204,8 @@ def test_round_trip() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0))])
 def test_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
-    """Shuffled or in a unit of a power of two, the bits are the same; rotated and in any unit, the tetrahedra are the
-    same."""
+    """Shuffling, or scaling by a power of two, gives the same bits; rotating and scaling by any factor gives the same
+    tetrahedra."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     lying = Lying(cloud, find_base_plane(cloud, np.array(up, float)))
     _, cage = body_cage(lying)

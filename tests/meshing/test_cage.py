@@ -1,4 +1,4 @@
-"""The cage: enclosure, quality, flat floor, determinism; isosurface stuffing; the voxel solid."""
+"""The cage: enclosure, element quality, flat base, determinism, isosurface stuffing, and the voxel solid."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _cloud(points: np.ndarray, sigma: float, opacity: float = 0.9, device: str |
 
 
 def _box_surface(low: tuple[float, ...], high: tuple[float, ...], count: int, seed: int = 0) -> np.ndarray:
-    """Random points on the six sides of a box."""
+    """Return random points (count, 3) on the six sides of a box."""
     random = np.random.default_rng(seed)
     points = random.uniform(low, high, (count, 3))
     axis, side = random.integers(0, 3, count), random.integers(0, 2, count)
@@ -54,7 +54,7 @@ def _box_surface(low: tuple[float, ...], high: tuple[float, ...], count: int, se
 
 
 def _check(cage: Cage, plane: Plane, *, flat: float = 1e-9) -> None:
-    """Check the properties of all cages."""
+    """Assert the guarantees of every cage."""
     height = cage.height(plane)
     above = plane.heights(cage.mesh.nodes)
     assert above.min() >= -flat * height
@@ -90,7 +90,7 @@ def test_pawn_cage(device: str) -> None:
     _check(cage, thing.plane)
     assert cage.method is CageMethod.VOXEL
     assert cage.height(thing.plane) == pytest.approx(1.0, abs=0.04)
-    # The base, 0.29 in radius, rests on a disc of that size: bottom faces cover its area to within the dilation.
+    # The base is a disc of radius 0.29: the faces of the cage on the floor cover its area up to the dilation.
     floor = [f for f in cage.mesh.boundary_faces() if np.all(cage.mesh.nodes[f, 2] < 1e-9)]
     corners = cage.mesh.nodes[np.array(floor)][:, :, :2]
     sides = corners[:, 1:] - corners[:, :1]
@@ -125,7 +125,7 @@ def test_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> N
 
 @pytest.mark.parametrize("scale", [0.1, 3.0])
 def test_scale_free(scale: float) -> None:
-    """The cage of the scaled object is the scaled cage."""
+    """The cage of a scaled object has the volume of the scaled cage to 1 %, and almost as many nodes."""
     thing, cage = _pawn_cage(6000)
     scaled = build_cage(thing.cloud.scaled(scale), thing.plane.scaled(scale))
     assert abs(len(scaled.mesh.nodes) - len(cage.mesh.nodes)) < 0.05 * len(cage.mesh.nodes)
@@ -150,7 +150,8 @@ def test_thin_legs_survive() -> None:
 
 
 def test_floaters_and_strays_make_no_elements() -> None:
-    """Far floaters, a faint giant Gaussian and fuzz below the floor do not change the cage."""
+    """Far floaters, a faint giant Gaussian and Gaussians below the floor change the volume of the cage by at most 5
+    %."""
     body = _box_surface((-0.2, -0.2, 0.0), (0.2, 0.2, 1.0), 8000)
     random = np.random.default_rng(1)
     floaters = random.uniform(-4.0, 4.0, (150, 3)) * [1, 1, 0.5] + [0.0, 0.0, 4.0]
@@ -170,7 +171,7 @@ def test_floaters_and_strays_make_no_elements() -> None:
 
 @pytest.mark.slow
 def test_open_and_pierced_surface_is_filled() -> None:
-    """A shell without a bottom and with a hole in its side is still a solid."""
+    """The cage of a shell without a bottom and with a hole in its side is filled as if the shell were closed."""
     shell = _box_surface((-0.3, -0.3, 0.0), (0.3, 0.3, 1.0), 12000)
     closed = build_cage(_cloud(shell, 0.01), _FLOOR)
     shell = shell[(shell[:, 2] > 0.01) & ~((shell[:, 0] > 0.29) & (np.abs(shell[:, 2] - 0.5) < 0.06))]
@@ -195,7 +196,8 @@ def test_degenerate_objects(points: np.ndarray, message: str) -> None:
 
 @pytest.mark.parametrize("shape", ["sheet", "disc"])
 def test_a_thin_body_is_refused_with_a_remedy(shape: str) -> None:
-    """A hundredth as thick as long, without side walls: elements would make it several times as thick."""
+    """The body has no side walls and is a hundredth as thick as long; the elements of a cage would make it several
+    times as thick."""
     random = np.random.default_rng(0)
     points = random.uniform(-0.5, 0.5, (4000, 3))
     if shape == "disc":
@@ -214,7 +216,8 @@ def test_a_thin_body_is_refused_with_a_remedy(shape: str) -> None:
 
 @pytest.mark.parametrize(("thickness", "thickening"), [(0.4, 1.2), (0.15, 1.35)])
 def test_thickening_of_a_slab(thickness: float, thickening: float) -> None:
-    """The thinner the slab, the larger the part of the cage's margin in its height."""
+    """The thickening is the height of the cage divided by the thickness of the slab; it is larger for a thinner
+    slab."""
     cage = build_cage(_cloud(_box_surface((-0.5, -0.5, 0.0), (0.5, 0.5, thickness), 6000), 0.005), _FLOOR)
     assert cage.thickening == pytest.approx(cage.height(_FLOOR) / (thickness + 0.01), rel=0.02)
     assert 1.0 < cage.thickening < thickening
@@ -244,7 +247,7 @@ def test_tetwild(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_lattice_is_used_if_tetwild_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The cage reports which mesher made it."""
+    """The cage reports the mesher that was used, and equals a cage of the lattice."""
     monkeypatch.setattr("egs_warp.meshing.cage.tetwild", lambda *_: None)
     thing, lattice = _pawn_cage(6000)
     cage = build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD)
@@ -258,9 +261,9 @@ def test_the_lattice_is_used_if_tetwild_fails(monkeypatch: pytest.MonkeyPatch) -
 @example(38649, 0.10291887719719599)
 @given(st.integers(0, 10**6), st.floats(0.08, 0.16))
 def test_stuffing_quality(seed: int, cell: float) -> None:
-    """For any smooth solid: a closed surface, a flat floor, the volume of the level set, no angle below the 9.26
-    degrees of ``test_stuffing_bound``; at the floor, where lattice tetrahedra are halved, no angle below 7 degrees (one
-    of 6,400 solids had less than 9.9).
+    """For smooth solids, the surface is closed, the base is flat, and the volume is that of the level set. No dihedral
+    angle is below the 9.26 degrees of ``test_stuffing_bound``, except at the floor, where lattice tetrahedra are halved
+    and the limit is 7 degrees (one of 6,400 solids had less than 9.9).
     """
     random = np.random.default_rng(seed)
     axes, centre = random.uniform(0.3, 0.5, 3), np.array([0.0, 0.0, 0.31]) + random.uniform(-0.05, 0.05, 3)
@@ -323,7 +326,7 @@ def test_enclosed_kernel_against_a_slow_twin(device: str) -> None:
 
 
 def test_solid_ignores_order_of_gaussians() -> None:
-    """Integer sums: any order of the Gaussians gives the same solid."""
+    """Any order of the Gaussians gives the same solid, because the sums are of integers."""
     thing = pawn(gaussian_count=5000)
     shuffled = thing.cloud.subset(np.random.default_rng(0).permutation(thing.cloud.count))
     first, second = (solid_from_gaussians(cloud) for cloud in (thing.cloud, shuffled))

@@ -1,4 +1,4 @@
-"""A user's own cage: what is read, what is refused, and that a body is built from it."""
+"""Cage files of the user: formats that are read, meshes that are refused, and bodies that are built from them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _UPRIGHT = BodyFrame(np.eye(3), np.zeros(3), 1.0)
 
 @cache
 def tower() -> TetMesh:
-    """A block of 4 x 4 x 8 cells of size 1 on the ground."""
+    """Return a block of 4 x 4 x 8 cells of size 1 on the ground."""
     return box_mesh((4, 4, 8), (4.0, 4.0, 8.0))
 
 

@@ -1,4 +1,4 @@
-"""Parts that stick out of simple bodies."""
+"""Protrusions of simple bodies: arms and tails, but not legs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.support.meshes import UP, carved, coarse_stool, column, figure
 
 
 def dog() -> TetMesh:
-    """A trunk on four legs, with a tail that hangs behind it."""
+    """Create a trunk on four legs with a tail that hangs behind it."""
 
     def keep(c: np.ndarray) -> np.ndarray:
         (x, y), z = c[:, :2].T, c[:, 2]

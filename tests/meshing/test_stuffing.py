@@ -1,4 +1,4 @@
-"""The least dihedral angle of isosurface stuffing, by search over all states of a lattice tetrahedron."""
+"""The minimum dihedral angle of isosurface stuffing, by search over all states of a lattice tetrahedron."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ from egs_warp.meshing import stuffing
 CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, -0.5, 0.5], [0.5, 0.5, 0.5]])
 """Corners of a lattice tetrahedron in units of the cube side: two ends of a long edge, then two of the opposite one."""
 STEPS = np.array([*(np.array(d) - 0.5 for d in product((0, 1), repeat=3)), *np.eye(3), *-np.eye(3)])
-"""From a lattice point to its 14 neighbours: 8 short edges, 6 long ones."""
+"""Vectors (14, 3) from a lattice point to its neighbours, in units of the cube side: 8 short edges, then 6 long
+ones."""
 INSIDE, OUTSIDE = -2, -1
-"""State of a corner that was not moved; other states are indices into ``STEPS``, along which the corner was moved."""
+"""States of corners that were not moved. A state of 0 or more is an index into ``STEPS``: the corner was moved along
+that edge."""
 PAIRS = stuffing._CORNER_PAIRS
 IS_LONG = np.isin(np.arange(6), [0, 5])
 
 
 def is_possible(states: tuple[int, ...]) -> bool:
-    """Return True if some signs of the lattice points lead to these states: the ends of an edge along which a point was
-    moved have opposite signs, and no edge has two cuts."""
+    """Return True if these states follow from some signs of the lattice points: the two ends of an edge along which a
+    corner was moved have opposite signs, and no edge has two cuts."""
 
     def point(x: np.ndarray) -> tuple[int, ...]:
         return tuple((2.0 * x).round().astype(int))
@@ -43,13 +45,13 @@ def is_possible(states: tuple[int, ...]) -> bool:
 
 
 def least_angle(states: np.ndarray, moved: np.ndarray, cuts: np.ndarray, order: list[int]) -> float:
-    """Return the least dihedral angle, degrees, of the tetrahedra that fill lattice tetrahedra in these states.
+    """Return the minimum dihedral angle, degrees, of the tetrahedra that fill lattice tetrahedra in these states.
 
     Args:
         states: (n, 4) states of the corners.
-        moved: (4,) fraction of the longest move.
+        moved: (4,) displacement of each corner as a fraction of its limit.
         cuts: (6,) position of the cut on each edge, from 0, closest to the first end, to 1.
-        order: order of the corners, which decides between diagonals of equal rank.
+        order: order of the corners, which selects one of two diagonals of equal rank.
     """
     limits = np.where(np.arange(14) < 8, stuffing._SNAP_SHORT, stuffing._SNAP_LONG)
     signs = np.select([states == INSIDE, states == OUTSIDE], [1, -1], 0)[:, order]
@@ -68,12 +70,13 @@ def least_angle(states: np.ndarray, moved: np.ndarray, cuts: np.ndarray, order: 
 
 @pytest.mark.slow
 def test_stuffing_bound() -> None:
-    """Away from the floor the least dihedral angle is 9.269 degrees.
+    """Away from the floor, the minimum dihedral angle is 9.269 degrees.
 
-    A corner of a tetrahedron is inside, outside, or was moved by at most its limit along one of 14 edges; an edge from
-    inside to outside is cut no nearer to either end than the limit, as the end would have been moved otherwise. All
-    states that agree with signs of the lattice points are tried with moves and cuts at their ends and middles; the
-    least angle is at ends. The 10.7 degrees of the paper hold for smaller limits and its parity rule for diagonals.
+    A corner of a tetrahedron is inside, outside, or was moved by at most its limit along one of 14 edges. An edge from
+    inside to outside is cut no nearer to either end than the limit, because the end would have been moved otherwise.
+    The search covers all states that are consistent with signs of the lattice points. Moves and cuts take the lower
+    limit, middle and upper limit of their ranges; the minimum is at limits. The paper's bound of 10.7 degrees holds for
+    smaller limits and its parity rule for diagonals.
     """
     states = np.array([s for s in product(range(-2, 14), repeat=4) if INSIDE in s and is_possible(s)])
     patterns, pattern_of = np.unique(np.minimum(states, 0), axis=0, return_inverse=True)

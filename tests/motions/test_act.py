@@ -1,4 +1,4 @@
-"""Gestures on top of a motion: objectives of a posed figure, measured sizes, and the end of the motion."""
+"""Gestures on top of a motion: objectives for a posed figure, measured sizes, and the end of the motion."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ def head_objective(act: Act, state: BodyState) -> Objective:
 
 
 def test_the_head_is_turned_at_the_rate_of_the_curve_and_towards_it(person: Stance) -> None:
-    """Before the dip, a head on the curve turns forward and down; one that is ahead of it turns more slowly."""
+    """Before the lowest point of a nod, a head on its curve rotates forward and down; a head that is ahead of the curve
+    rotates more slowly."""
     gesture = nod(person, NOD)
     (channel,) = gesture.channels
     time = float(0.5 * (channel.times[1] + channel.times[2]))
@@ -77,7 +78,7 @@ def test_a_gesture_is_measured_relative_to_the_heading(person: Stance, heading: 
 
 
 def test_the_rotation_of_a_part_is_no_error_of_the_body(person: Stance) -> None:
-    """The measured rotation of a body whose head alone is rotated is upright, if the gesture requests that."""
+    """A body of which only the head is rotated, as the gesture requests, is measured as upright."""
     gesture = nod(person, NOD)
     act, time = Act(person, [(0.0, gesture)]), float(gesture.channels[0].times[2]) - DT
     act.objectives(BodyState(person.standing, 0 * person.standing), None, DT)
@@ -96,8 +97,8 @@ def test_the_rotation_of_a_part_is_no_error_of_the_body(person: Stance) -> None:
 
 
 def test_overlapping_gestures_of_one_part_are_added(person: Stance) -> None:
-    """There is one objective for the head, whose target is the sum of both curves; a part that has turned with the body
-    before the gesture began does not turn at its start."""
+    """The head has one objective, whose target is the sum of both curves. A part that has turned with the body before
+    the start of the gesture does not turn at its start."""
     shakes = gesture_of("shake", person)
     state = BodyState(person.standing, 0 * person.standing)
     targets = []

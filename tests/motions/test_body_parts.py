@@ -1,4 +1,4 @@
-"""Head and branches of simple bodies."""
+"""Heads and branches that are found on simple bodies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.support.stances import standing_stance
 
 
 def doll() -> TetMesh:
-    """A head of half the height above a narrow neck, on a block."""
+    """Create a block with a narrow neck and a head of half the height."""
 
     def keep(c: np.ndarray) -> np.ndarray:
         across, z = np.abs(c[:, :2]).max(axis=1), c[:, 2]
@@ -25,7 +25,7 @@ def doll() -> TetMesh:
 
 
 def rabbit() -> TetMesh:
-    """The same with a smaller head and two ears."""
+    """Create a block with a narrow neck, a smaller head and two ears."""
 
     def keep(c: np.ndarray) -> np.ndarray:
         (x, y), z = np.abs(c[:, :2]).T, c[:, 2]
@@ -42,7 +42,8 @@ def parts_of(mesh: TetMesh) -> ShapeParts:
 
 
 def test_a_big_head_is_a_part_as_a_whole() -> None:
-    """Not only the topmost 0.15 of the height, so that a key does not crush it."""
+    """The head is the whole part above the neck, not only the topmost 0.15 of the height, so that a key frame does not
+    crush it."""
     mesh = doll()
     head = parts_of(mesh).head
     assert head is not None
@@ -54,7 +55,7 @@ def test_a_big_head_is_a_part_as_a_whole() -> None:
 
 
 def test_a_head_has_its_ears() -> None:
-    """Both ears end higher than the head; one of them continues its branch, the other starts there."""
+    """Both ears end above the head and belong to it; one of them is also a branch of its own."""
     mesh = rabbit()
     parts = parts_of(mesh)
     assert parts.head is not None
@@ -66,7 +67,7 @@ def test_a_head_has_its_ears() -> None:
 
 
 def test_arms_are_branches_from_left_to_right() -> None:
-    """Counterclockwise from straight ahead (+y): the left arm comes first."""
+    """Branches are numbered counterclockwise from straight ahead (+y), so the left arm comes first."""
     stance = standing_stance(figure())
     arms = [part for part in parts_of_body(stance) if part.name.startswith("branch")]
     assert [part.name for part in arms] == ["branch 1", "branch 2"]

@@ -1,4 +1,4 @@
-"""Crawl: a wave of strides runs along a long body, which reaches its target in any direction."""
+"""Crawling of a long body by a wave of strides: strain limit, unloaded sections, and targets ahead and aside."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Crawled:
     trajectory: Trajectory
     reports: list[StepReport]
     place: np.ndarray
-    """(3,) planar pose at the end."""
+    """(3,) planar pose at the end: position, m, and heading, rad."""
 
 
 def crawled(route: Route) -> Crawled:
@@ -66,7 +66,8 @@ def test_a_body_along_the_ground_crawls() -> None:
 
 
 def test_a_stride_strains_the_body_within_its_limit() -> None:
-    """The limit is reached at the steepest point of the wave; every section ends at the target of the body."""
+    """The maximum strain, at the steepest point of the wave, is close to the limit; every section ends at the
+    target."""
     crawl = Crawl(worm().place, straight_route(5.0))
     crawl._to = np.array([crawl.step_limits.length, 0.0, 0.0])
     along_it, most = crawl._standing[:, 0], 0.0
@@ -82,8 +83,7 @@ def test_a_stride_strains_the_body_within_its_limit() -> None:
 
 
 def test_lifted_sections_are_unloaded_from_the_front() -> None:
-    """After a quarter of a cycle the front is lifted and the back stands, after three quarters it is the other way
-    round."""
+    """At 0.2 of a cycle the front of the body is unloaded, at 0.8 the back."""
     made = worm()
     crawl = Crawl(made.place, straight_route(1.0))
     crawl.objectives(made.start, None, DT)

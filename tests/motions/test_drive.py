@@ -1,4 +1,5 @@
-"""Drive: the route is extended while it runs, no step exceeds its limits, and a zero command ends in a stance."""
+"""Driven walks: the route is extended during the walk, no step exceeds its limits, and a zero command ends in a
+stance."""
 
 from __future__ import annotations
 
@@ -106,8 +107,8 @@ def test_the_route_follows_the_current_command() -> None:
 
 
 def test_the_route_continues_from_slipping_feet() -> None:
-    """Feet that lag by a step shift the route; also in the closing swings of three groups of feet, which come after the
-    last pose."""
+    """If the feet lag by one step, the rest of the route is shifted, also in the closing swings of three groups of
+    feet, which follow the last pose."""
     place = stool().place
     walk, standing = DrivenWalk(place, Drive(0.1)), place.ground.local(place.standing)
     before, length = walk.planar_poses.copy(), walk.planar_poses[1, 0]
@@ -134,8 +135,8 @@ def test_a_quick_command_makes_the_gait_quicker() -> None:
 
 @pytest.mark.slow
 def test_a_stool_is_driven_and_stands_again() -> None:
-    """Forward for 1.5 s, of which the first half second shifts the weight: the distance follows from the speed within a
-    step, and it stands at the end."""
+    """The stool is driven forward for 1.5 s and first shifts its weight for 1.5 sqrt(H / g). Its displacement is speed
+    times the remaining time, to within one step, and it stands at the end."""
     made, speed = stool(), 0.06
     plan = DrivePlan((0.0, 1.5), (Drive(speed), Drive()))
     driven = ScriptedDrive(made.place, plan)

@@ -1,4 +1,4 @@
-"""Falls by tilt and by contacts; flights, landings and intended tilts are not falls."""
+"""Detection of falls by tilt and by contacts; flights, landings and intended tilts are not falls."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def creature() -> CoarseCreature:
 
 
 class Stands:
-    """A motion that has objectives and never rests."""
+    """Motion that has objectives and never rests."""
 
     is_at_rest = False
 
@@ -51,7 +51,8 @@ def watched(creature: CoarseCreature, begin: Any = Stands) -> FallMonitor:
 def feed_monitor(
     creature: CoarseCreature, watch: FallMonitor, *, degrees: float, load: float, seconds: float, on: str = "base"
 ) -> None:
-    """Feed the monitor a body rotated by an angle, with ``load`` of its weight on its base or its top."""
+    """Pass the monitor a body that is rotated by ``degrees`` and has ``load`` times its weight on its base or its top,
+    for some ``seconds``."""
     body, start = creature.place.body, creature.start
     turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
     state = BodyState(start.positions @ turn.T, start.velocities)
@@ -89,7 +90,7 @@ def test_a_fallen_body_has_no_objectives(creature: CoarseCreature) -> None:
 
 
 def test_a_body_that_gets_up_is_not_monitored(creature: CoarseCreature) -> None:
-    """The motion that fell is marked, getting up replaces it, and only its failure counts as a fall."""
+    """A motion that falls is marked and replaced by getting up; the monitor reports a fall only if getting up fails."""
     sequence = MotionSequence(creature.place, [MotionTask("stand", {}, cast(Any, Stands))])
     watch = FallMonitor(sequence, creature.place, gets_up=True)
     feed_monitor(creature, watch, degrees=90.0, load=1.0, seconds=1.0)
@@ -111,7 +112,8 @@ def test_keys_may_tip_the_body(creature: CoarseCreature) -> None:
 
 
 def test_a_body_on_its_side_has_fallen() -> None:
-    """A run of the stepper with weak muscles: they relax, and the run ends shortly after."""
+    """In a simulation with weak muscles, a body on its side is reported as fallen; its muscles relax, and the run ends
+    after ``REST_FRAMES``."""
     creature = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD, strength=0.2)
     turn = Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
     positions = creature.start.positions @ turn.T

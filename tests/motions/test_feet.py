@@ -1,4 +1,4 @@
-"""Feet of simple bodies, and their slip, swings and landings in a trajectory."""
+"""Feet of simple bodies, and slip, displacement and landings of feet in a trajectory."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def test_other_bodies_have_other_numbers_of_feet(mesh: TetMesh, height: float, c
 
 
 def test_a_base_has_a_left_and_a_right_side() -> None:
-    """A gap in the middle separates the sides. The share of a foot in the body above it decreases sideways and
-    upwards."""
+    """The base is divided into two feet with a gap between them. The weight of a foot in the nodes above it decreases
+    sideways and upwards."""
     mesh = block_mesh(5, 5, 5)
     heights, sole = mesh.nodes[:, 2], np.flatnonzero(mesh.nodes[:, 2] == 0.0)
     left, right = split_base(mesh.nodes[:, :2], heights, sole, 1.0)
@@ -61,7 +61,7 @@ def test_a_base_has_a_left_and_a_right_side() -> None:
 
 
 def made_trajectory() -> Trajectory:
-    """Return six steps of a stool of 100 kg: foot 0 slides by 1 mm per step under load for three steps, swings by 50 mm
+    """Return six steps of a stool of 100 kg. Foot 0 slides by 1 mm per step under load for three steps, swings by 50 mm
     in one, and stands still for two.
     """
     strides = np.array([0.0, 0.001, 0.001, 0.001, 0.05, 0.0, 0.0]).cumsum()
@@ -85,8 +85,8 @@ def made_trajectory() -> Trajectory:
 
 
 def test_slip_is_the_path_of_loaded_contacts_without_swings() -> None:
-    """3 mm over three steps; the shift of the sole is counted from where the foot was placed, so it is 2 mm; one
-    landing."""
+    """The loaded foot slips by 3 mm in three steps. The shift of its sole is measured from the end of the first loaded
+    step, so it is 2 mm. Both are relative to the stride of 0.1 m. There is one landing."""
     assert foot_of_node(FEET)[FEET[0].sole[0]] == 0
     fell = footfalls(made_trajectory(), FEET, stride=0.1)
     assert (fell.slip, fell.sole_shift) == (pytest.approx(0.03), pytest.approx(0.02))

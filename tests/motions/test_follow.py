@@ -1,4 +1,5 @@
-"""Key frames: measured quantities of a posed block, objectives of the next step, and messages about missed keys."""
+"""Following key frames: measured quantities of a posed block, objectives of the next step, and messages about missed
+keys."""
 
 from __future__ import annotations
 
@@ -29,7 +30,7 @@ def key(time: float, part: str, quantity: Quantity, value: tuple[float, float, f
 
 @pytest.mark.parametrize("part", ["body", "base", "head", "foot"])
 def test_each_quantity_is_measured_in_its_unit_along_forward_left_up(place: Stance, part: str) -> None:
-    """A rigid motion with forward +y and left -x; lengths are in H, angular momentum in units of m H^2."""
+    """The body has a rigid motion; forward is +y and left is -x. Lengths are in H, angular momenta in m H^2 / s."""
     body, height = place.body, place.body.height
     follow = Follow(place, [key(1.0, part, Quantity.POSITION, (0.1, 0.0, 0.0))])
     turn = Rotation.from_rotvec(np.radians(30.0) * np.array([0.0, 0.0, 1.0]))
@@ -48,7 +49,8 @@ def test_each_quantity_is_measured_in_its_unit_along_forward_left_up(place: Stan
 
 
 def test_a_position_key_requests_the_speed_of_its_curve(place: Stance) -> None:
-    """On the curve, the target speed of the head is that of the curve; behind it, it is higher."""
+    """If the head is on the curve, its target speed is that of the curve; if it is behind, the target speed is
+    higher."""
     follow = Follow(place, [key(1.0, "head", Quantity.POSITION, (0.2, 0.0, 0.0))])
     (channel,) = follow.channels
     still = BodyState(place.standing, 0 * place.standing)
@@ -67,7 +69,7 @@ def test_a_position_key_requests_the_speed_of_its_curve(place: Stance) -> None:
 
 
 def test_each_key_has_its_own_weight(place: Stance) -> None:
-    """The weight 1 of the first key applies until that key; the weight 9 of the second one from then on."""
+    """The weight 1 of the first key applies until that key, and the weight 9 of the second key afterwards."""
     value = (0.1, 0.0, 0.0)
     keys = [Key(time, "head", Quantity.POSITION, value, weight) for time, weight in ((6 * DT, 1.0), (12 * DT, 9.0))]
     follow, found = Follow(place, keys), []
@@ -92,8 +94,8 @@ def test_keys_of_the_whole_body_replace_its_own_balance_or_spin(place: Stance) -
 
 
 def test_feet_are_ordered_counterclockwise_from_straight_ahead() -> None:
-    """Forward is +y and left is -x. For a stool the order is front left, back left, back right, front right; for a
-    figure left, right."""
+    """Forward is +y and left is -x. The order is front left, back left, back right, front right for a stool, and left,
+    right for a figure."""
     for mesh, corners in (
         (stool(), [(-1, 1), (-1, -1), (1, -1), (1, 1)]),
         (figure(), [(-1, 0), (1, 0)]),
@@ -169,7 +171,8 @@ def test_a_trajectory_ends_when_the_body_is_slow_or_after_a_limit(place: Stance)
 
 
 def test_positions_are_held_after_their_last_key_and_velocities_are_not(place: Stance) -> None:
-    """After the last key of a body velocity, the balance objectives apply again; a head position stays a target."""
+    """After the last key of the body velocity, the balance objectives apply again, while the head position remains a
+    target."""
     keys = [key(0.1, "body", Quantity.VELOCITY, (0.3, 0.0, 0.0)), key(0.2, "head", Quantity.POSITION, (0.1, 0.0, 0.0))]
     follow = Follow(place, keys)
     names = []
@@ -180,7 +183,7 @@ def test_positions_are_held_after_their_last_key_and_velocities_are_not(place: S
 
 
 def spun(place: Stance, degrees: float, time: float) -> BodyState:
-    """Return the state of the block, rotated about up where it stands."""
+    """Return the state of the block at rest, rotated about the up axis by ``degrees``."""
     centre = place.body.centre_of_mass(place.standing)
     turn = Rotation.from_rotvec([0.0, 0.0, degrees], degrees=True)
     return BodyState(centre + turn.apply(place.standing - centre), 0 * place.standing, time)
@@ -189,8 +192,8 @@ def spun(place: Stance, degrees: float, time: float) -> BodyState:
 @pytest.mark.parametrize("part", ["body", "head"])
 @pytest.mark.parametrize("asked", [170.0, 180.0, 270.0, 360.0, -360.0])
 def test_a_turn_is_measured_in_the_requested_direction(place: Stance, part: str, asked: float) -> None:
-    """A complete turn has no error; one that lacks 10 degrees has an error of 10 degrees, and no turn has the error of
-    the whole angle."""
+    """A complete turn has no error, a turn that lacks 10 degrees has an error of 10 degrees, and a body that does not
+    turn has an error of the whole angle."""
     for share, miss in ((1.0, 0.0), (1.0 - 10.0 / abs(asked), 10.0), (0.0, abs(asked))):
         follow = Follow(place, [key(1.0, part, Quantity.ORIENTATION, (0.0, 0.0, asked))])
         for time in np.linspace(0.0, 1.0, 61):
@@ -201,8 +204,8 @@ def test_a_turn_is_measured_in_the_requested_direction(place: Stance, part: str,
 
 @pytest.mark.parametrize("behind", [0.0, 20.0, 190.0])
 def test_a_turn_over_half_is_steered_in_the_requested_direction(place: Stance, behind: float) -> None:
-    """Late in a turn by 350 degrees, the target rate is that of the curve plus a correction of the error, however
-    large."""
+    """Late in a turn by 350 degrees, the target rate is the rate of the curve plus a gain times the error, also for
+    errors above 180 degrees."""
     follow = Follow(place, [key(2.0, "body", Quantity.ORIENTATION, (0.0, 0.0, 350.0))])
     (channel,), body = follow.channels, place.body
     follow.objectives(spun(place, 0.0, 0.0), None, DT)

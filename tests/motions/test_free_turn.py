@@ -1,4 +1,4 @@
-"""Bodies that turn in the air, against the closed form of a symmetric top."""
+"""Rotation of a rigid body in the air, against the closed form of a symmetric top."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ def test_about_a_principal_axis_a_body_does_not_wobble() -> None:
 
 @pytest.mark.parametrize("turn", [0.4, -1.6, 4.0])
 def test_a_tilted_body_reaches_the_requested_rotation(turn: float) -> None:
-    """A spin about up alone would leave the body tilted by degrees; the spin found by root search ends upright."""
+    """The requested rotation vector divided by the time is a spin that misses the target by more than 0.5 degrees; the
+    spin from the root search misses it by less than 0.02 degrees."""
     inertia, upright, asked = leaning([0.5, 0.8, 0.3], 0.25), np.array([0.05, -0.08, 0.02]), np.array([0.0, 0.0, turn])
     goal = Rotation.from_rotvec(asked) * Rotation.from_rotvec(upright)
 

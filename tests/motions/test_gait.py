@@ -15,8 +15,8 @@ GAIT = Gait.create(4, 4, 0.03, LEGGED_TIMING, time_unit=0.32)
 
 @given(st.integers(2, 9))
 def test_every_foot_swings_once_per_cycle_and_not_with_its_neighbour(count: int) -> None:
-    """With more than three feet, several swing together, with four those on a diagonal. At least one foot always
-    stands."""
+    """Neighbouring feet never swing together, and at least one foot stands at any time. With four feet, those on a
+    diagonal swing together."""
     groups = feet_in_turn(count)
     assert sorted(foot for group in groups for foot in group) == list(range(count))
     assert all(0 < len(group) < count for group in groups)
@@ -40,8 +40,8 @@ def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
 
 @given(st.integers(2, 7))
 def test_the_progress_of_the_body_is_that_of_its_feet(feet: int) -> None:
-    """Far from both ends, the progress in the middle of a swing is the mean over the groups of feet, averaged over
-    before and after; it is uniform."""
+    """Far from both ends of a walk, the progress of the body in the middle of a swing is the mean progress of all
+    groups of feet, averaged over before and after the swing. It increases by one per swing."""
     gait = Gait.create(feet, 40, 0.03, LEGGED_TIMING, time_unit=0.3)
     swing, rounds = 20, len(gait.groups)
     before = np.mean([gait.target_step(swing - 1 - k) for k in range(rounds)])

@@ -1,4 +1,4 @@
-"""Gestures: the curves of the motions that act, and the bodies that cannot do them."""
+"""Gestures: their curves, and the errors for bodies that cannot make them."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_nod_has_as_many_dips_as_requested(person: Stance) -> None:
 
 
 def test_a_wave_raises_the_tip_of_the_right_branch(person: Stance) -> None:
-    """The arms are equally high: the right one waves, and a small rotation of the curve moves its tip up."""
+    """The right one of two arms at equal height waves. A small rotation along the curve moves its tip up."""
     gesture = wave(person, defaults("wave"))
     (part,), (channel,) = gesture.parts, gesture.channels
     local = person.ground.local(person.standing)
@@ -81,7 +81,8 @@ def test_a_groove_is_on_the_beats_and_to_both_sides(person: Stance) -> None:
 
 
 def test_a_heavy_head_leans_the_body_less(person: Stance) -> None:
-    """The head of a bow is the part above the neck; one that is most of the body is replaced by its top."""
+    """In a bow of 30 degrees, the head rotates relative to the body, and the whole body leans by 0.2 to 0.4 of the
+    angle."""
     head, whole = bow(person, {"degrees": 30.0}).channels
     assert head.part == "head" and whole.part == WHOLE_BODY
     assert 0.2 * 30.0 <= whole.values[:, 1].max() <= 0.4 * 30.0

@@ -1,4 +1,4 @@
-"""Get up: a lying body pushes itself up about the edge of its base, rolls over it and stands."""
+"""Getting up: a lying body pushes itself up, rolls over the edge of its base and stands."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def lying(degrees: float, axis: np.ndarray = LEFT) -> BodyState:
 
 @pytest.mark.parametrize(("degrees", "axis"), [(90.0, LEFT), (-60.0, LEFT), (170.0, FORWARD)])
 def test_tilt_of_a_lying_body(degrees: float, axis: np.ndarray) -> None:
-    """The angle to upright, and the horizontal axis of the rotation back."""
+    """The tilt is the angle to upright and the horizontal axis of the rotation back to it."""
     angle, about = GetUp(block().place)._tilt(lying(degrees, axis).positions)
     assert np.degrees(angle) == pytest.approx(abs(degrees), abs=1e-6)
     assert about == pytest.approx(-np.sign(degrees) * axis, abs=1e-6)
@@ -48,12 +48,13 @@ def test_tilt_of_a_lying_body(degrees: float, axis: np.ndarray) -> None:
 
 @pytest.mark.parametrize("degrees", [30.0, 60.0, 90.0, 120.0])
 def test_the_highest_point_is_over_the_edge_of_the_roll(degrees: float) -> None:
-    """The centre of mass of a block is highest above an edge: half of its diagonal, for any edge."""
+    """While a block rolls back to upright, its centre of mass is highest over an edge, at half of the diagonal, or at
+    the start if it is tilted by less than the diagonal."""
     get_up, state = GetUp(block().place), lying(degrees)
     arms = state.positions - get_up.body.centre_of_mass(state.positions)
     top = get_up._top(arms, -LEFT, np.radians(degrees))
     edges = [np.hypot(*(np.ptp(block().place.standing, axis=0)[[0, 2]])) / 2.0]
-    # Beyond its diagonal, it still has to roll over an edge; within it, it only descends.
+    # A block tilted by more than its diagonal has to roll over an edge; otherwise its centre of mass only descends.
     start = float(get_up.body.centre_of_mass(state.positions)[2] - state.positions[:, 2].min())
     steepest = np.degrees(np.arctan2(0.5, 1.0))
     assert top == pytest.approx(edges[0] if degrees > steepest else start, rel=0.03)
@@ -61,8 +62,8 @@ def test_the_highest_point_is_over_the_edge_of_the_roll(degrees: float) -> None:
 
 
 def test_the_body_rotates_about_the_edge_of_its_base() -> None:
-    """The targets of the centre of mass and of the spin are one rotation about the lower edge of the base. Without
-    support behind that edge, they are those of the free fall back."""
+    """The target velocity of the centre of mass and the target spin form one rotation about the lower edge of the base.
+    Later, the spin is that of a body that falls back about this edge."""
     get_up, state = GetUp(block().place), lying(90.0)
     get_up.phase, get_up._entered, get_up._push = GetUpPhase.ROLL, 0.0, 50.0
     com, spin, _ = get_up.objectives(replace(state, time=0.05), None, DT)
@@ -87,7 +88,8 @@ def test_attempts_differ() -> None:
 
 
 def test_a_body_that_was_caught_stands_low() -> None:
-    """The target velocity of the centre of mass is downward in a crouched stand, zero in a straight one."""
+    """The target velocity of the centre of mass is downward in a crouched stand, but not in a straight one; a stand
+    that begins in motion is not at rest."""
     made = block()
     for crouch, down in ((1.0, False), (0.75, True)):
         stand = Stand(made.place, at_rest=False, crouch=crouch)
@@ -125,7 +127,8 @@ def test_getting_up_fails_after_all_attempts() -> None:
 
 @cache
 def risen(degrees: float, sideways: bool) -> tuple[FallMonitor, list[StepReport], BodyState, BodyState]:
-    """Simulate a body that lies on its side during two motions of standing, the first of which lasts a second."""
+    """Simulate a body that starts on its side, with two stands, the first of which lasts a second. Return the monitor,
+    all reports, and the first and the last state."""
     made, start = block(), lying(degrees, FORWARD if sideways else LEFT)
     parts = [
         MotionTask("stand", {}, lambda place: StandFor(place, 1.0)),
@@ -133,7 +136,7 @@ def risen(degrees: float, sideways: bool) -> tuple[FallMonitor, list[StepReport]
     ]
     watch = FallMonitor(MotionSequence(made.place, parts), made.place, gets_up=True)
     state, memory, reports = start, made.stepper.initial_memory(), []
-    # Enough steps for all attempts.
+    # The number of steps suffices for all attempts.
     for _ in range(1800):
         wishes = watch.objectives(state, reports[-1] if reports else None, DT)
         state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)
@@ -161,7 +164,7 @@ def test_a_block_gets_up_and_continues(degrees: float, sideways: bool) -> None:
 
 @pytest.mark.slow
 def test_getting_up_takes_little_work() -> None:
-    """An attempt takes some m g H of muscle work (at most 14 of those measured)."""
+    """An attempt takes less than 20 m g H of muscle work (measured: at most 14)."""
     watch, _, _, _ = risen(90.0, False)
     _, entry, last = watch.sequence.done
     assert isinstance(entry.motion, GetUp)

@@ -1,4 +1,4 @@
-"""Hops of a block that is posed by hand: they aim at squares."""
+"""Targets of hops on a row of squares, for a block that is posed by hand."""
 
 from __future__ import annotations
 

@@ -19,7 +19,8 @@ from tests.support.stances import DT, block_place, moved
 
 
 def test_the_landing_frame_is_that_of_the_landed_body(place: Stance) -> None:
-    """From take-off on, a body that stands at the target, rotated, has the local coordinates of the start."""
+    """From take-off on, local coordinates are relative to the target: a body that stands there, rotated, has the local
+    coordinates of the start."""
     target = JumpTarget(0.5, 0.3, 0.1)
     jump = Jump(place, target, facing=TurnHeading(place, 0.8))
     start = place.ground.local(place.standing)
@@ -40,7 +41,7 @@ def test_the_lean_follows_the_distance_up_to_a_limit(place: Stance, distance: fl
 
 @pytest.mark.parametrize(("mesh", "soles"), [(coarse_stool(), 4), (None, 1)])
 def test_soles_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, soles: int) -> None:
-    """The soles of feet on legs, and the base of other bodies, have forward and no sideways target velocities."""
+    """The target velocities of the soles, or of the base of a body without legs, are forward, not sideways."""
     place = block_place(mesh)
     jump = Jump(place, JumpTarget(0.5, 0.3))
     jump.phase = JumpPhase.THRUST
@@ -53,8 +54,8 @@ def test_soles_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, soles: int
 
 
 def test_an_unstable_landing_has_full_balance_weights() -> None:
-    """Weights are low while the capture point is near the centre of the feet and full once it is at their edge; they
-    are almost zero in the first step, in which the ground stops the fall."""
+    """The balance weights are low if the capture point is near the centre of the feet, and full if it is at their edge.
+    They are almost zero in the first step, in which the ground stops the fall."""
     place = block_place()
     weights = []
     for time, speed in ((1.0, 0.0), (1.0, 2.0), (0.0, 2.0)):
@@ -84,9 +85,9 @@ def test_the_pose_in_the_air_is_blended_in() -> None:
 
 @pytest.mark.parametrize(("com_speed", "flat"), [(1.0, True), (-0.25, False), (-1.0, True)])
 def test_a_body_moving_towards_its_feet_keeps_its_soles_flat(com_speed: float, flat: bool) -> None:
-    """A body sheared backwards over a flat sole has a mean rotation of half the shear. While it moves towards its feet,
-    no rotation is requested, because its sole would tilt up; while it falls back from them, it rotates upright, unless
-    it falls so fast that braking takes all that the feet can give."""
+    """A body sheared backwards over a flat sole has a mean rotation of half the shear. If it moves towards its feet, no
+    rotation is requested, because the sole would tilt up. If it falls backwards, it is rotated upright, unless it falls
+    so fast that stopping it needs the whole capacity of the feet."""
     place = block_place()
     height = place.standing[:, 2:] - place.standing[:, 2].min()
     sheared = place.standing + 0.1 * height / height.max() * [-1.0, 0.0, 0.0]
@@ -101,9 +102,9 @@ def test_a_body_moving_towards_its_feet_keeps_its_soles_flat(com_speed: float, f
 
 @pytest.mark.parametrize(("toes", "fraction"), [(0.05, 0.0), (0.2, MAX_FOOTHOLD_OFFSET)])
 def test_feet_are_placed_ahead_so_that_the_body_stops(toes: float, fraction: float) -> None:
-    """If the target is too near to stop, the capture point is ahead of the middle of the feet by at most a fraction of
-    their forward reach, however far they reach behind; it is at the middle of feet that reach ahead by a few degrees
-    only."""
+    """If the target is too near for the body to stop, the capture point is ahead of the middle of the feet by a
+    fraction ``MAX_FOOTHOLD_OFFSET`` of their forward reach, whatever their backward reach. If the forward reach is
+    short, it is at the middle."""
     place = block_place()
     touching = place.contact_points[place.contact_points[:, 0] < toes + 1e-9]
     place = replace(place, contact_points=np.vstack([touching, [toes, 0.0, 0.0]]))

@@ -1,4 +1,4 @@
-"""The plan of a jump, against flight, thrust and pendulum integrated step by step."""
+"""The plan of a jump, against thrust, flight and an inverted pendulum, integrated step by step."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ GRAVITY, STEP = 9.81, 1 / 60
 )
 @pytest.mark.parametrize("height", [1.0, 1.7])
 def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTarget, height: float) -> None:
-    """Thrust and flight are implicit Euler steps, each with its end velocity; the landing is a linear inverted
-    pendulum.
-    """
+    """Thrust and flight are integrated by implicit Euler; the landing is a linear inverted pendulum."""
     com_height, ahead = 0.45 * height, 0.2 * height
     plan = plan_jump(
         target,
@@ -30,9 +28,9 @@ def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTa
         lean=LEAN_FRACTION * target.distance,
     )
 
-    # Thrust: from rest at the bottom of the crouch, an acceleration that first grows and is then constant, up to
-    # take-off, where the body is stretched by the extension. With acceleration p over the displacement s it reaches
-    # speed_up^2 / 2 = mean of p over s, times the displacement.
+    # Thrust: from rest at the bottom of the crouch to take-off, where the body is stretched by the extension, the
+    # acceleration first increases and is then constant. Its mean over the displacement, times the displacement, is
+    # speed_up^2 / 2.
     times = np.linspace(0.0, plan.thrust_time, 4001)
     moves = [plan.thrust(np.zeros(3), time) for time in times]
     up, speeds = np.array([place[2] for place, _ in moves]), np.array([speed[2] for _, speed in moves])
@@ -49,7 +47,7 @@ def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTa
     push = plan.speed_up**2 / (2.0 * way)
     least, deepest = plan.extension + 0.02 * height, 0.26 * com_height
     assert 0.0 < plan.extension < target.height and plan.crouch_depth > 0.0
-    # The thrust has 2.8 g; more if the crouch is as deep as the body allows, less if it is as shallow as is possible.
+    # The thrust has an acceleration of 2.8 g, more at the maximum depth of the crouch, less at the minimum depth.
     if plan.crouch_depth > deepest - 1e-9:
         assert plan.crouch_depth == pytest.approx(deepest) and push > 2.8 * GRAVITY
     elif way < least + 1e-9:
@@ -57,7 +55,8 @@ def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTa
     else:
         assert push == pytest.approx(2.8 * GRAVITY, rel=1e-6)
 
-    # Flight: up to the requested height, then down to where the stretched body stands on its landing surface.
+    # Flight: up to the requested height, then down to the height at which the stretched body touches its landing
+    # surface.
     z, speed, apex, time = plan.extension, plan.speed_up, 0.0, 0.0
     while speed > 0.0 or z > plan.extension + target.rise:
         speed -= GRAVITY * STEP
@@ -100,8 +99,8 @@ def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTa
 @pytest.mark.parametrize("landing_time", [0.02, 0.11, 0.3])
 @pytest.mark.parametrize("fall", [0.5, 2.0])
 def test_feet_stop_a_body_with_a_gradual_landing(landing_time: float, fall: float) -> None:
-    """A pendulum under the load that stops the fall at a constant rate, then under its weight, comes to rest over its
-    feet. The feet are further ahead than for a fall that stops at once.
+    """A linear inverted pendulum comes to rest over its feet; its load is first the one that stops the fall at a
+    constant rate, then its weight. The feet are further ahead than for a fall that stops at once.
     """
     com_height, speed = 0.5, 1.3
     lever = speed * stopping_time(com_height, fall, GRAVITY, landing_time)
@@ -119,8 +118,8 @@ def test_feet_stop_a_body_with_a_gradual_landing(landing_time: float, fall: floa
 
 @pytest.mark.parametrize("distance", [0.6, 0.75, 0.8, 1.2])
 def test_a_thrust_is_long_enough_for_friction_to_give_the_speed(distance: float) -> None:
-    """The friction impulse is at most mu times the normal impulse of weight and upward acceleration. The crouch is
-    deeper by at most 0.02 H for that; if friction is sufficient anyway, it is unchanged.
+    """The friction impulse is at most mu times the normal impulse of weight and upward acceleration. If that does not
+    suffice for the forward speed, the crouch is deeper by at most 0.02 H; otherwise it is unchanged.
     """
     lean = 0.05
 
@@ -145,7 +144,7 @@ def test_a_thrust_is_long_enough_for_friction_to_give_the_speed(distance: float)
     if distance == 0.6:
         assert plan == easy and spare(plan) > 0.0
     elif distance == 0.75:
-        # It is computed with the speed of a thrust of zero duration, and is slightly longer than necessary.
+        # The planner assumes the speed of a thrust of zero duration, so the thrust is slightly longer than necessary.
         assert 0.0 < deeper < 0.02 and 0.0 < spare(easy) < spare(plan) < 0.3
     elif distance == 0.8:
         assert deeper == pytest.approx(0.02) and spare(easy) < 0.0 < spare(plan)
@@ -181,7 +180,7 @@ def test_a_given_lean_is_used() -> None:
 
 @pytest.mark.parametrize("step", [1 / 30, 1 / 60, 1 / 90])
 def test_a_crouch_ends_after_a_whole_number_of_steps(step: float) -> None:
-    """Otherwise the target of its last step would be for less than a whole step: a jolt against the motion."""
+    """If the last step of the crouch were shorter, the target velocity would jump at its end."""
     plan = plan_jump(
         JumpTarget(0.5, 0.2), height=1.0, com_height=0.45, support_ahead=0.2, gravity=GRAVITY, step=step, lean=0.1
     )

@@ -53,7 +53,8 @@ def test_curve_passes_through_keys_starts_at_rest_and_never_overshoots(tmp_path:
 
 
 def test_the_second_derivative_is_that_of_the_curve(tmp_path: Path) -> None:
-    """Between two keys it is the difference quotient of the rates; after the last key it is zero."""
+    """Between two keys, the second derivative equals the difference quotient of the rates; after the last key it is
+    zero."""
     (channel,) = channels(
         read_keyframes(written(tmp_path, "k.json", [GOOD, {**GOOD, "time": 1.0, "value": [0, 0, 0]}]))
     )

@@ -1,4 +1,4 @@
-"""A landing in a crouch that is held."""
+"""A jump that ends in a held crouch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Limbs and feet of bodies of many shapes: the support depends on the limbs above as much as on the ground."""
+"""Limbs and feet of bodies of many shapes: the kind of support follows from the limbs as well as from the contact with
+the ground."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from egs_warp.motions.limbs import Sections, find_limbs
 from tests.support.meshes import carved, coarse_stool, column, figure, stool
 
 Shape = Callable[[np.ndarray], np.ndarray]
-"""Function that returns which of the points (n, 3) are inside."""
+"""Function that returns (n,) bool: which of the points (n, 3) are inside."""
 SIZE = (1.0, 1.0, 1.0)
 
 
@@ -69,7 +70,7 @@ BODIES = {
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("tilt", [0.0, 1.0, -1.0])
 def test_support_of_bodies(name: str, tilt: float) -> None:
-    """The support is found on the true plane and on one that is off by a degree."""
+    """The kind of support and the number of feet are correct for the true plane and for one tilted by a degree."""
     mesh, count, base = BODIES[name]
     normal = Rotation.from_euler("y", tilt, degrees=True).as_matrix()[:, 2]
     heights = mesh.nodes @ normal
@@ -77,7 +78,7 @@ def test_support_of_bodies(name: str, tilt: float) -> None:
 
 
 def short_legged(p: np.ndarray) -> np.ndarray:
-    """True inside a table whose leg at +x, +y ends 0.05 above the ground."""
+    """Return True for points inside a table whose leg at +x, +y ends 0.05 above the ground."""
     legs = np.abs(np.abs(p[:, :2]) - 0.35).max(axis=1) < 0.1
     ends = np.where((p[:, :2] > 0.0).all(axis=1), 0.05, 0.0)
     return (legs & (p[:, 2] > ends)) | (p[:, 2] > 0.7)
@@ -125,8 +126,8 @@ def test_legs_on_a_thick_slab_stand_on_one_base() -> None:
 
 @pytest.mark.parametrize(("length", "count"), [(1.4, 2), (0.8, 4)])
 def test_legs_on_runners_stand_on_the_runners(length: float, count: int) -> None:
-    """Armchairs have such runners; a connection of legs as close as those of a chair may be a flaw of the capture. Both
-    the mesh and the solid that it was made from are tested."""
+    """A body on two long runners, such as an armchair, has two feet. If the legs are close, as those of a chair, their
+    connection may be a flaw of the capture, and there are four feet. Mesh and lattice solid are tested."""
 
     def sledge(p: np.ndarray) -> np.ndarray:
         posts = (np.abs(np.abs(p[:, 0]) - 0.5 * length + 0.1) < 0.1) & (np.abs(np.abs(p[:, 1]) - 0.4) < 0.1)
@@ -143,7 +144,7 @@ def test_legs_on_runners_stand_on_the_runners(length: float, count: int) -> None
 
 
 def test_a_raised_tail_carries_nothing() -> None:
-    """The tail rises from the same slab as the trunk."""
+    """The tail rises from the same slab as the trunk, so there is a single base."""
     mesh = mesh_of(
         lambda p: (
             (p[:, 2] < 0.1)
@@ -155,8 +156,8 @@ def test_a_raised_tail_carries_nothing() -> None:
 
 
 def test_gaps_finer_than_the_cage_are_found_in_the_solid() -> None:
-    """Two legs are 0.06 apart in a cage without a gap: the lattice of the capture resolves the gap, and the feet are
-    joined."""
+    """Two legs are 0.06 apart, but their cage has no gap. The lattice of the capture resolves the gap; the feet are
+    marked as joined."""
     spacing = 1.0 / 64.0
     places = np.stack(np.meshgrid(*[np.arange(n) for n in (49, 33, 65)], indexing="ij"), axis=-1)
     points = spacing * (places - [24, 16, 0])
@@ -173,7 +174,7 @@ def test_gaps_finer_than_the_cage_are_found_in_the_solid() -> None:
 
 
 def test_feet_are_ordered_counterclockwise_from_straight_ahead() -> None:
-    """A foot ten degrees to the right of straight ahead is the first, one twenty degrees to the right is the last."""
+    """A foot ten degrees to the right of straight ahead comes first; a foot twenty degrees to the right comes last."""
 
     def at(*degrees: float) -> np.ndarray:
         return np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], axis=1)

@@ -12,8 +12,8 @@ RATE = 4.4
 
 
 def test_a_plan_solves_the_pendulum_and_ends_over_the_pressure() -> None:
-    """c'' = w^2 (c - p), starting with the planned divergent component, follows the plan and does not diverge, although
-    p jumps."""
+    """The solution of c'' = w^2 (c - p) with the planned initial divergent component follows the plan and does not
+    diverge, although p jumps."""
     step = 0.05
     pressure = np.array([[0.1, 0.0]] * 8 + [[0.0, 0.2]] * 6 + [[0.3, 0.1]] * 30)
     plan = PendulumPlan.from_pressure(pressure, step, RATE)

@@ -1,4 +1,5 @@
-"""Pushes: impulses and gusts in momenta, energy balance and audit; a standing body keeps its balance, or falls."""
+"""Pushes: impulses and gusts in the balances of momenta and energy, and a standing body that keeps its balance or
+falls."""
 
 from __future__ import annotations
 
@@ -71,8 +72,8 @@ def test_steps_share_out_all_of_a_push(push: Push, dt: float) -> None:
 
 
 def test_a_push_has_its_momentum_and_its_lever_arm(standing_block: CoarseCreature) -> None:
-    """The unit m sqrt(g H) is the whole body at its unit of speed; a push at the top rotates the body, a push of all
-    nodes does not."""
+    """An impulse of 1 m sqrt(g H) gives the whole body the velocity sqrt(g H). A push near the top or the bottom
+    rotates the body, a push of all nodes does not."""
     place, body = standing_block.place, standing_block.place.body
     for height in (None, 0.9, 0.1):
         kick = PushKicks(place, [Push(0.0, 0.3 * LEFT, height)])(0.0, DT)
@@ -101,8 +102,7 @@ def test_a_push_acts_near_its_height(standing_block: CoarseCreature) -> None:
 
 
 def test_the_balances_include_the_pushes(pushed: Trajectory) -> None:
-    """Both momenta and the energy of every step balance as without pushes; they do not if one push is missing or 1 %
-    stronger."""
+    """The balances of momenta and energy hold in every step; they do not if one push is left out or is 1 % stronger."""
     assert len(pushed.kick_step) == 1 + 6
     held = audit(pushed)
     assert held.energy_residual < 1e-8
@@ -117,8 +117,8 @@ def test_the_balances_include_the_pushes(pushed: Trajectory) -> None:
 def test_a_pushed_body_moves_with_the_push_and_keeps_its_feet(
     standing_block: CoarseCreature, pushed: Trajectory
 ) -> None:
-    """A tenth of a second after the first push its centre of mass has moved to the left; in the end the body is upright
-    and at rest."""
+    """A tenth of a second after the first push, the centre of mass has moved to the left. At the end the body has
+    hardly moved its soles and is almost at rest."""
     place = standing_block.place
     com = np.array([place.body.centre_of_mass(place.ground.local(x)) for x in pushed.positions])
     after = int(np.searchsorted(pushed.time, 0.2))
@@ -130,8 +130,8 @@ def test_a_pushed_body_moves_with_the_push_and_keeps_its_feet(
 
 
 def test_a_hard_push_topples_the_body(standing_block: CoarseCreature) -> None:
-    """Its energy is several times what lifts the centre of mass over the edge, so that no controller can keep
-    balance."""
+    """The push adds several times the energy that lifts the centre of mass over the edge, so that no controller can
+    keep balance."""
     simulation, fallen = simulate_pushes(standing_block, "0.05 1 left 0.9", frames=90)
     assert fallen is not None and fallen.startswith("tilted by")
     assert audit(simulation.trajectory).energy_residual < 1e-6

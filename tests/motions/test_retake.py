@@ -1,4 +1,4 @@
-"""Retakes: the motion that fell becomes gentler, and is judged by what was requested."""
+"""Retakes: a motion that fell is repeated more gently; its requested values do not change."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def begun(script: Script, place: Stance) -> list[BodyMotion]:
 
 
 def test_the_motion_that_fell_becomes_softer_and_then_lower(place: Stance) -> None:
-    """Motion 2 is the second of the two hops, which are changed together."""
+    """Motion 2 is the second of two hops, which are changed together; motion 3 is changed twice."""
     script = motion("jump 0.5 0.2, hop 0.5 0.2 x2, jump 0.4 0.2")
     softer, change = retaken(script, 2)
     assert [request.retake for request in softer.requests] == [0, 1, 0] and change == "hop slower and softer"

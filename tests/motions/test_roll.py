@@ -1,4 +1,4 @@
-"""Roll: a ball reaches its target without slipping, and continues from any orientation."""
+"""Rolling: a ball reaches its target without slipping, and is recognised in any orientation."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Rolled:
 
 @cache
 def rolled() -> Rolled:
-    """Simulate a roll past a point ahead and to the left."""
+    """Simulate a roll along the path ``WAY``, ahead and to the left."""
     made = ball()
     sequence = MotionSequence(
         made.place, [MotionTask("walk to", {}, lambda place: move_along(place, path_route(WAY), 0.1))]

@@ -33,8 +33,8 @@ def test_turns_on_the_spot_in_even_paces(angle: float) -> None:
 
 @given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
 def test_a_point_is_reached_in_any_direction(ahead: float, left: float) -> None:
-    """The route ends at the point, moves in the direction of the heading except in the last step, and no step exceeds
-    the limits of length and turn, which share one budget."""
+    """The route ends at the point and moves along its heading except in the last step. The fractions of the limits of
+    length and turn that a step uses add up to at most 1."""
     places = path_route(np.array([[ahead, left]]))(PACE)
     assert places[-1, :2] == pytest.approx([ahead, left], abs=1e-8)
     steps = np.diff(places, axis=0)
@@ -46,7 +46,7 @@ def test_a_point_is_reached_in_any_direction(ahead: float, left: float) -> None:
 
 
 def test_a_path_is_followed_past_its_points() -> None:
-    """The route passes within a step of each point and is hardly longer than the path."""
+    """The route passes each point within the length of a step and is only slightly longer than the path."""
     points = np.array([[0.5, 0.0], [0.9, 0.3], [0.9, 0.8]])
     places = path_route(points)(PACE)
     for point in points:

@@ -47,7 +47,8 @@ def test_a_json_script_is_the_same_as_its_line(tmp_path: Path) -> None:
 
 
 def test_gestures_run_on_top_of_a_motion(tmp_path: Path) -> None:
-    """``+`` adds a gesture, ``at`` seconds after the motion has started; in JSON, ``with`` lists them."""
+    """In a line, ``+`` adds a gesture that begins ``at`` seconds after the motion; in JSON, ``with`` lists the
+    gestures."""
     walk, look = motion("walk 1 + wave 60 at=0.5 + nod count=3, look around 40 + nod at=2").requests
     assert (walk.name, walk.asked["distance"]) == ("walk", 1.0)
     waves, nods = walk.layers

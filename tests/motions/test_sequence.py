@@ -46,8 +46,8 @@ def test_facing_rotates_the_frame_and_not_the_body(place: Stance) -> None:
 
 @pytest.mark.parametrize(("slope", "rise", "height"), [(0.1, 0.05, 0.2), (-0.1, -0.05, 0.2), (0.4, 0.2, 0.3)])
 def test_a_jump_lands_on_the_ground_ahead(place: Stance, slope: float, rise: float, height: float) -> None:
-    """Half a metre up or down a slope; the apex clears the higher landing surface by at least half of the requested
-    0.2."""
+    """The jump lands half a metre up or down a slope. Its apex is above the landing surface by at least half of the
+    requested height of 0.2."""
     normal = np.array([-slope, 0.0, 1.0]) / np.hypot(1.0, slope)
     target = replace(place, solids=(Solid((Plane(normal, 0.0),)),)).landing(JumpTarget(0.5, 0.2))
     assert (target.distance, target.rise, target.height) == pytest.approx((0.5, rise, height))
@@ -74,7 +74,7 @@ def test_motions_jump_onto_the_solid_ahead(place: Stance, name: str) -> None:
 
 
 class Waits:
-    """Rests after three steps."""
+    """Motion that rests after three steps."""
 
     def __init__(self, place: Stance) -> None:
         self.place, self.steps = place, 0

@@ -1,4 +1,4 @@
-"""Skip: the jumps of a row, and when the next one starts."""
+"""Skipping: the jumps of a row, and the condition that starts the next one."""
 
 from __future__ import annotations
 

@@ -24,7 +24,8 @@ def measured_body(
 
 
 def swing(place: Stance, state: BodyState, seen: Measurement, spin: np.ndarray) -> np.ndarray:
-    """Return the velocity (2,), m/s, that corresponds to the angular momentum of a ``spin`` (3,) about the feet."""
+    """Return the velocity (2,), m/s, of the centre of mass whose angular momentum about the feet equals that of a
+    ``spin`` (3,), rad/s."""
     momentum = place.ground.axes @ place.body.inertia(state.positions) @ spin / (place.body.mass * seen.com[2])
     return np.array([momentum[1], -momentum[0]])
 
@@ -35,9 +36,9 @@ def swing(place: Stance, state: BodyState, seen: Measurement, spin: np.ndarray) 
 def test_balance_targets_are_the_nearest_that_do_not_tip(
     place: Stance, wanted: tuple[float, float], turning: tuple[float, float, float], up: float
 ) -> None:
-    """The change of m h (v + swing) is the load times the distance of the centre of pressure from the centre of mass,
-    and the centre of pressure is within the footprint. Of all such targets, the controller picks the one with the least
-    error of velocity and spin."""
+    """The rate of change of m h (v + swing) is the load times the distance of the centre of pressure from the centre of
+    mass, and the centre of pressure is within the footprint. Of all such targets, the controller selects the one with
+    the least error of velocity and spin."""
     pose, state, seen = measured_body(place, 1e3, (0.05, -0.03, 0.1))
     asked, spin = np.array([*wanted, up]), np.array(turning)
     velocity, turned = pose.balance_targets(seen, asked, spin, DT)
@@ -53,7 +54,7 @@ def test_balance_targets_are_the_nearest_that_do_not_tip(
     axis = place.ground.axes[2]
     inertia = place.body.inertia(state.positions)
     assert axis @ inertia @ turned == pytest.approx(axis @ inertia @ spin, abs=1e-9)
-    # A grid search over velocity and swing, for each axis separately, finds no smaller error.
+    # Reference: a grid search over velocity and swing, for each axis separately.
     gyration = 0.5 * np.trace(inertia) / (place.body.mass * height**2)
     line = np.linspace(-1.0, 1.0, 2001)
     for k in (0, 1):
@@ -68,9 +69,9 @@ def test_balance_targets_are_the_nearest_that_do_not_tip(
 
 @pytest.mark.parametrize(("ahead", "is_driven"), [(0.02, True), (0.12, False)])
 def test_uprighting_does_not_drive_a_body_off_its_feet(place: Stance, ahead: float, is_driven: bool) -> None:
-    """A body at rest is turned backward by more than its feet allow. Near the middle of its support, the deficit is
-    shared, so the body moves forward; with the centre of mass half-way to the edge, it does not, and the centre of
-    pressure is still at the edge."""
+    """A body at rest should rotate backward faster than its feet allow, so the centre of pressure is at the edge. If
+    the centre of mass is near the middle of the support, the body also moves forward; if it is half-way to the edge, it
+    does not."""
     pose, state, seen = measured_body(place, 1e3, (ahead, 0.0, 0.0))
     velocity, turned = pose.balance_targets(seen, np.zeros(3), np.array([0.0, -2.0, 0.0]), DT)
     assert velocity[0] > 1e-3 if is_driven else velocity[0] == pytest.approx(0.0, abs=1e-12)
@@ -93,7 +94,8 @@ def test_feasible_targets_are_unchanged_and_a_falling_body_may_move_in_both_dire
 
 @pytest.mark.parametrize("up", [0.0, 0.25])
 def test_requests_are_limited_by_friction(place: Stance, up: float) -> None:
-    """Coulomb: a request keeps its direction and is limited to 0.95 of the friction; a smaller one is unchanged."""
+    """A request is scaled, with its direction unchanged, to at most 0.95 of the friction; a smaller one is
+    unchanged."""
     pose, _, seen = measured_body(place, 0.05, (0.0, 0.0, 0.0))
     wanted = np.array([0.009, -0.012])
     most = 0.95 * 0.05 * (GRAVITY + up / DT) * DT
@@ -105,8 +107,8 @@ def test_requests_are_limited_by_friction(place: Stance, up: float) -> None:
 
 @pytest.mark.parametrize("way", [(1.0, 0.0), (-1.0, 0.0), (0.6, -0.8)])
 def test_on_a_slope_friction_gives_less_uphill(way: tuple[float, float]) -> None:
-    """The limited request is on the cone about the ground's normal: uphill it is weight x tan(friction angle - slope),
-    computed by hand."""
+    """The limited force is on the friction cone about the normal of the ground; uphill, its horizontal part is the
+    weight times tan(friction angle - slope)."""
     friction, slope = 0.3, np.radians(8.0)
     rising = np.array([-np.sin(slope), 0.0, np.cos(slope)])
     push, weight = np.array([*way, 0.0]), np.array([0.0, 0.0, 2.0])
@@ -122,7 +124,7 @@ def test_on_a_slope_friction_gives_less_uphill(way: tuple[float, float]) -> None
 
 @pytest.mark.parametrize("spin", [(0.0, -2.0, 0.0), (1.5, 1.0, 0.2)])
 def test_spin_replaces_velocity_where_friction_is_low(place: Stance, spin: tuple[float, float, float]) -> None:
-    """On slippery ground, too, the requested centre of pressure is within the footprint."""
+    """On slippery ground, the velocity is limited by friction, and the centre of pressure is within the footprint."""
     pose, state, seen = measured_body(place, 0.3, (0.05, -0.03, 0.1))
     velocity, turned = pose.balance_targets(seen, np.array([0.3, 0.01, 0.0]), np.array(spin), DT)
     change = velocity[:2] + swing(place, state, seen, turned)
@@ -133,8 +135,8 @@ def test_spin_replaces_velocity_where_friction_is_low(place: Stance, spin: tuple
 
 
 def test_a_body_that_rotates_forward_is_caught_further_ahead(place: Stance) -> None:
-    """The capture point follows from the angular momentum about the feet: for a body at rest, the acceleration over its
-    position is zero, and spin counts as the velocity with the same momentum."""
+    """The capture point follows from the angular momentum about the feet: a spin counts as the velocity of the centre
+    of mass with the same angular momentum."""
     pose, state, seen = measured_body(place, 1.0, (0.0, 0.0, 0.0))
     np.testing.assert_allclose(pose.capture_acceleration(seen, seen.com[:2]), 0.0, atol=1e-12)
     ahead = BodyState(state.positions, np.broadcast_to(0.1 * place.ground.axes[0], state.positions.shape))
@@ -149,7 +151,8 @@ def test_a_body_that_rotates_forward_is_caught_further_ahead(place: Stance) -> N
 
 @pytest.mark.parametrize(("ahead", "urgency"), [(0.0, 0.0), (0.05, 0.25), (-0.1, 0.5), (0.3, 1.5)])
 def test_the_capture_margin_is_relative_to_the_edge(place: Stance, ahead: float, urgency: float) -> None:
-    """The base extends by 0.2 metres in both directions; only the speed varies."""
+    """The base extends by 0.2 m to both sides, and only the speed of the body varies. The margin is the distance of the
+    capture point from the middle, divided by 0.2 m."""
     pose = BalanceController(place.body, place.ground, place.standing, place.contact_points, place.friction)
     height = place.body.centre_of_mass(place.standing)[2]
     speed = np.array([ahead * np.sqrt(GRAVITY / height), 0.0, 0.0])
@@ -158,8 +161,8 @@ def test_the_capture_margin_is_relative_to_the_edge(place: Stance, ahead: float,
 
 
 def test_a_leaning_body_rotates_as_in_its_static_bend(place: Stance) -> None:
-    """The static bend under a horizontal load is solved densely with the sole clamped: the pose is the nearest affine
-    map by mass, by least squares."""
+    """The pose equals the best affine fit, weighted by mass, to the static bend under a horizontal body force with the
+    sole clamped, which is solved densely."""
     pose, _, seen = measured_body(place, 0.8, (0.0, 0.0, 0.0))
     body, assembly = place.body, place.body.assembly
     upper = assembly.matrix(assembly.hessian_entries(place.standing, projected=True)).toarray()

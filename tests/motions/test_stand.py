@@ -33,7 +33,8 @@ def test_the_upright_posture_is_that_of_no_gesture(place: Stance) -> None:
 
 
 def test_the_centre_of_mass_moves_with_its_target(place: Stance) -> None:
-    """From rest on the target, one step gains its acceleration and twice its velocity times the rate of the law."""
+    """For a body at rest at its target, the velocity after a step is the step size times the target acceleration plus 2
+    sqrt(g / h) times the target velocity."""
     nothing = np.zeros(3)
     aside = objectives(place, PostureTarget(np.array([0.0, 0.02, -0.01]), nothing, nothing, nothing))[0]
     assert aside[1] > 0.0 > aside[2] and abs(aside[0]) < 1e-9
@@ -46,7 +47,7 @@ def test_the_centre_of_mass_moves_with_its_target(place: Stance) -> None:
 
 
 def test_the_body_turns_to_its_posture(place: Stance) -> None:
-    """At a rate of 4 sqrt(g / H) times the angle, as far as the feet allow it."""
+    """The target rate is 4 sqrt(g / H) times the angle, for an angle that is small enough for the feet."""
     nothing = np.zeros(3)
     _, spin = objectives(place, PostureTarget(nothing, nothing, nothing, np.array([0.0, 0.01, 0.0])))
     rate = place.ground.axes @ np.linalg.solve(place.body.inertia(place.standing), spin)

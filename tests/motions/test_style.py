@@ -26,25 +26,25 @@ from tests.support.stances import FORWARD
 
 @dataclass(frozen=True)
 class Jumped:
-    """Heights of the centre of mass, metres, and times, seconds."""
+    """Heights of the centre of mass, m, and times, s, of a simulated jump."""
 
     depth: float
-    """Depth of the crouch."""
+    """Depth of the crouch, m."""
     lowest: float
-    """End of the crouch."""
+    """Time of the lowest point of the crouch, s."""
     take_off: float
     apex: float
-    """Rise above the standing height."""
+    """Maximum rise above the standing height, m."""
     dip: float
-    """Descent below the standing height after touch-down."""
+    """Maximum descent below the standing height after touch-down, m."""
     rebound: float
-    """Rise above the standing height after that."""
+    """Maximum rise above the standing height after this descent, m."""
     heights: tuple[float, ...]
 
 
 @cache
 def jumped(style: str | None) -> Jumped:
-    """Simulate a jump of a block by 0.2 on the spot in this ``style``, and check the audit."""
+    """Simulate a jump of a block on the spot, by 0.2 body heights, in this ``style``, and assert the audit."""
     made = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
     place = made.place if style is None else replace(made.place, style=read_style(style))
     sequence = MotionSequence(place, motion("jump 0 0.2").parts(place.body.height))
@@ -71,7 +71,7 @@ def test_the_usual_style_changes_no_bit() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["anticipation", "timing"])
 def test_anticipation_and_timing_lengthen_a_crouch(name: str) -> None:
-    """The duration changes by the factor, to the step; the requested height is still reached."""
+    """The duration of the crouch is scaled by the factor, to the precision of a step, so the take-off is later."""
     short, usual, long = jumped(f"{name}=0.7"), jumped(None), jumped(f"{name}=1.4")
     crouches = np.array([short.lowest, usual.lowest, long.lowest]) - 0.1  # it settles first
     np.testing.assert_allclose(crouches / crouches[1], [0.7, 1.0, 1.4], atol=0.06)
@@ -87,7 +87,8 @@ def test_anticipation_deepens_a_crouch() -> None:
 
 @pytest.mark.slow
 def test_timing_makes_a_thrust_soft() -> None:
-    """The mean acceleration is divided by the factor: a thrust to the same upward speed takes longer by it."""
+    """The mean acceleration is divided by the factor, so a thrust to the same upward speed takes longer by the
+    factor."""
     usual, *others = (planned(Style(timing=timing)) for timing in (1.0, 0.7, 1.4))
     np.testing.assert_allclose([other.thrust_time / usual.thrust_time for other in others], [0.7, 1.4], rtol=1e-6)
     assert others[0].speed_up == others[1].speed_up == usual.speed_up
@@ -109,7 +110,7 @@ def test_squash_lets_a_landing_give_way() -> None:
 
 
 def planned(style: Style) -> JumpPlan:
-    """Plan a jump so high that its stroke is at neither limit, in very short steps."""
+    """Plan a jump with very short steps, at a height for which the depth of the crouch is within its limits."""
     return plan_jump(
         JumpTarget(0.0, 0.3),
         height=1.0,
@@ -131,7 +132,7 @@ def test_a_dance_uses_the_crouch_time_of_its_style(place: Stance) -> None:
 
 
 def test_a_jump_of_a_script_may_have_its_own_style(place: Stance, tmp_path: Path) -> None:
-    """The style of a jump takes precedence over the style of the run, which the other jumps have."""
+    """The style of a jump takes precedence over the style of the run, which applies to the other jumps."""
     (tmp_path / "s.json").write_text(
         '[{"motion": "jump", "repeat": 2, "style": "squash=2"}, {"motion": "jump"},'
         ' {"motion": "jump", "style": "light"}]'

@@ -15,7 +15,7 @@ TRIANGLE = SupportPolygon.hull(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0], [0.
 
 @given(st.integers(0, 1000))
 def test_nearest_point_of_a_hull_is_the_best_convex_combination(seed: int) -> None:
-    """The closest weighted mean of the points, found by SciPy."""
+    """The distance to the nearest point equals that to the closest convex combination of the points, by SciPy."""
     rng = np.random.default_rng(seed)
     points, place = rng.standard_normal((8, 2)), 2.0 * rng.standard_normal(2)
     found = SupportPolygon.hull(points).nearest(place)
@@ -31,7 +31,7 @@ def test_nearest_point_of_a_hull_is_the_best_convex_combination(seed: int) -> No
 
 
 def test_nearest_point_of_a_line() -> None:
-    """The nearest point is between the ends, or one of them."""
+    """The nearest point of a line segment is between its ends or at one of them."""
     points = np.array([[0.0, 0.0], [1.0, 1.0], [0.5, 0.5]])
     for place, nearest in (([1.0, 0.0], [0.5, 0.5]), ([3.0, 1.0], [1.0, 1.0]), ([-1.0, 0.0], [0.0, 0.0])):
         assert SupportPolygon.hull(points).nearest(np.array(place)) == pytest.approx(nearest)
@@ -39,8 +39,8 @@ def test_nearest_point_of_a_line() -> None:
 
 
 def test_margins_of_a_triangle() -> None:
-    """A right triangle with legs of 3 m, far from the origin: its centroid is (1, 1), 1 m from two edges and sqrt(1/2)
-    from the third."""
+    """The triangle has a right angle and legs of 3 m, far from the origin. Its centroid is at (1, 1) from the right
+    angle: 1 m from two edges and sqrt(1/2) m from the third."""
     middle = np.array([101.0, 101.0])
     assert TRIANGLE.middle == pytest.approx(middle)
     assert TRIANGLE.margin(middle) == pytest.approx(np.sqrt(0.5))

@@ -1,4 +1,4 @@
-"""Turns of a block that is posed by hand: as many jumps as friction requires."""
+"""Turns of a block that is posed by hand: the number of jumps follows from friction."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from tests.support.stances import DT, moved
 
 
 def land(jump: Jump, state: BodyState) -> None:
-    """Put a jump into the state after its landing, one step before it rests."""
+    """Set the state of a jump to that after its landing, one step before it rests."""
     jump.phase, jump._entered = JumpPhase.LAND, -100.0
     jump.controller = jump._landing
 
 
 def test_a_turn_that_falls_short_is_completed_at_its_start(place: Stance) -> None:
-    """After a jump that is 25 degrees short and 0.1 to the side, the next jump turns by the rest and returns; 5 degrees
-    are tolerated."""
+    """After a jump that lacks 25 degrees and lands 0.1 m to the side, the next jump turns by the rest and returns; an
+    error of 5 degrees is tolerated."""
     turn = Turn(place, JumpTarget(0.0, 0.2), np.radians(60.0))
     short = moved(place, np.radians(35.0), np.array([0.1, 0.0, 0.0]))
     state = BodyState(short, 0 * short, 10.0)
@@ -60,11 +60,11 @@ def test_a_slippery_floor_takes_more_jumps(place: Stance) -> None:
 
 @pytest.mark.parametrize("points", ["disc", "rim"])
 def test_the_largest_turn_is_that_of_a_disc_on_rough_ground(place: Stance, points: str) -> None:
-    """The largest turn of a disc (docs/concepts/motions.md).
+    """The maximum turn equals the closed form of a disc to 5 % (docs/concepts/motions.md).
 
-    A disc pressed down by N resists rotation with 2/3 mu N R; the impulse during the thrust rotates the flying body.
-    The pyramid with four facets that replaces Coulomb's cone gives 1 / (|cos| + |sin|) of it in each direction. The
-    body is off the ground for nine tenths of the planned time, within a twentieth.
+    Friction under a disc of radius R with the normal force N has the torque 2/3 mu N R; its impulse during the thrust
+    rotates the body in flight. The pyramid with four facets that replaces Coulomb's cone reduces the friction in each
+    direction by 1 / (|cos| + |sin|). The flight is assumed to last for nine tenths of the planned time.
     """
     radius, mu = 0.15, 0.5
     angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)

@@ -18,7 +18,7 @@ from tests.support.stances import DT, block_place, moved
 
 
 def yaw_asked(jump: Jump, state: BodyState) -> float:
-    """Target angular momentum about up, kg m^2/s, of the step from ``state``."""
+    """Return the target angular momentum about the up axis, kg m^2/s, of the step from ``state``."""
     asked = jump.objectives(state, None, DT)[1]
     assert isinstance(asked, AngularMomentumObjective)
     return float(asked.target[2])
@@ -31,12 +31,12 @@ def inertia_about_up(place: Stance, positions: np.ndarray) -> float:
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.0 * np.pi])
 def test_a_twist_requests_the_remaining_spin_from_friction(turn: float) -> None:
-    """In the last step of the thrust, the target is the spin that completes the remaining turn of the standing body in
-    flight, whatever its present shape, with a reserve.
+    """In the last step of the thrust, the target is the spin that completes the remaining turn in flight, with a
+    reserve. It is computed for the standing body, whatever the current shape.
 
-    The target decreases in proportion to the completed turn. It is zero a few degrees before the end, the angle by
-    which the feet slide after landing. The heading is counted beyond half turns. The masses of the body are symmetric,
-    so the target against its tilt has no momentum about up.
+    The target decreases in proportion to the completed turn. It is zero at ``LANDING_SLIDE_ANGLE`` before the end, by
+    which the feet slide after landing. The heading is unwrapped beyond half turns. The masses of the body are
+    symmetric, so the target that corrects its tilt has no momentum about the up axis.
     """
     place = block_place(box_mesh((2, 2, 4), (0.4, 0.4, 1.0)))
     jump = twist(place, JumpTarget(0.0, 0.2), turn)
@@ -61,8 +61,8 @@ def test_a_twist_requests_the_remaining_spin_from_friction(turn: float) -> None:
 
 
 def test_a_twist_spins_up_with_the_upward_speed(place: Stance) -> None:
-    """The target of a step is proportional to the whole spin and to the ratio of the step size to the remaining time
-    of the thrust, so a body that rises at half of the take-off speed gets twice the target of a body at rest."""
+    """The target of a step is the whole spin times the ratio of the step size to the remaining time of the thrust. A
+    body that rises at half of the take-off speed therefore gets twice the target of a body at rest."""
     shares = []
     for risen in (0.0, 0.5):
         jump = twist(place, JumpTarget(0.0, 0.2), 1.0)
@@ -79,9 +79,9 @@ def test_a_twist_spins_up_with_the_upward_speed(place: Stance) -> None:
 
 
 def test_in_the_air_the_width_is_adjusted_to_the_turn(place: Stance) -> None:
-    """Angular momentum L is conserved: the inertia I (arms in or out) that turns by the remaining angle in the
-    remaining time is L t / angle. The target shape is approached at a constant rate; at the spin that fits the standing
-    shape, the target is zero."""
+    """The angular momentum L is conserved in flight, so a body that should turn by the remaining angle in the remaining
+    time t needs the inertia L t / angle. The target width gives this inertia, and its rate is proportional to the
+    difference of the widths. At the spin that fits the standing shape, the target is zero."""
     turn, speed = 1.5, 2.5
     left = turn - LANDING_SLIDE_ANGLE
     time = 2.0 * speed / 9.81
@@ -104,7 +104,7 @@ def test_in_the_air_the_width_is_adjusted_to_the_turn(place: Stance) -> None:
         shares = np.repeat(place.body.node_mass / place.body.mass, 3)
         assert np.allclose((shape.rows / shares) @ shape.rows.T, np.eye(6), atol=1e-12)
         wanted = (shape.rows.T @ shape.target / shares).reshape(-1, 3)
-        # Along the diagonal, so that a rotation by these strains does not count.
+        # Compare along the diagonal, where the strains cause no rotation.
         apart = (wanted[corners[1], :2] - wanted[corners[0], :2]).mean()
         if width == 1.0:
             assert abs(apart) < 1e-9

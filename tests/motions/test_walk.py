@@ -37,7 +37,7 @@ AHEAD = np.array([1.0, 0.0, 0.0])
 
 
 def biped() -> TetMesh:
-    """A slab on two legs with feet, 0.7 m high."""
+    """Create a slab on two legs with feet, 0.7 m high."""
 
     def keep(c: np.ndarray) -> np.ndarray:
         leg = (np.abs(np.abs(c[:, 1]) - 0.15) < 0.1) & (np.abs(c[:, 0]) < 0.1)
@@ -97,8 +97,8 @@ def strong(mesh: TetMesh, up: np.ndarray = UP) -> CoarseCreature:
 @pytest.mark.slow
 @pytest.mark.parametrize(("slope", "landings"), [(0.0, 4), (5.0, 5)])
 def test_a_coarse_stool_takes_a_step(slope: float, landings: int) -> None:
-    """One step, level and up a slope, and the closing step: each foot lands once, on the slope one of them twice, none
-    slips by 2 % of the stride, the distance is reached, and the audit holds."""
+    """The stool makes one step and the closing step, on level ground or up a slope. Each foot lands once, on the slope
+    one of them twice; the slip is less than 2 % of the stride, the distance is reached, and the audit holds."""
     tilt = np.radians(slope)
     done = walked(strong(coarse_stool(), np.array([np.sin(tilt), 0.0, np.cos(tilt)])), straight_route(0.06), 0.06)
     reached = measure(done.trajectory)
@@ -136,8 +136,8 @@ def test_a_block_waddles(route: Route) -> None:
 @pytest.mark.slow
 @pytest.mark.data
 def test_a_long_base_does_not_outrun_the_body(data_dir: Path) -> None:
-    """The base of the monkey is long; the body does not lag further behind its feet with each step, and reaches its
-    target."""
+    """The base of the monkey is long. The body reaches its target, because its lag behind the feet does not grow with
+    each step."""
     cloud = read_capture(data_dir / "objects" / "monkey.ply").cloud
     plane = find_base_plane(cloud, up=np.array([0.0, 1.0, 0.0]))
     done = simulate(make_creature(cloud, plane=plane), motion("walk 0.4"), get_up=False)
@@ -147,8 +147,8 @@ def test_a_long_base_does_not_outrun_the_body(data_dir: Path) -> None:
 
 
 def test_a_step_lost_to_slipping_is_repeated() -> None:
-    """Feet at their footholds continue; feet that lag by half a step repeat it, with one message, and the route ends at
-    the same place."""
+    """If the feet are at their footholds, the walk continues. If they lag by half a step or more, the step is repeated,
+    with one message, and the route ends at the same place."""
     place = coarse_creature(block_mesh(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, straight_route(0.12), 0.04)
     standing, before, paces = place.ground.local(place.standing), walk.planar_poses.copy(), walk.gait.step_count
@@ -182,8 +182,8 @@ def test_the_plan_respects_the_limits_of_the_legs() -> None:
 
 
 def test_footholds_rotate_with_the_body() -> None:
-    """They equal those of the whole standing body, rotated to each planar pose of the route about its initial centre of
-    mass."""
+    """The footholds equal the soles of the whole standing body, rotated to each planar pose of the route about its
+    initial centre of mass."""
     place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, path_route(np.array([[0.2, 0.3]])), 0.1)
     standing, com = place.ground.local(place.standing), place.body.centre_of_mass(place.ground.local(place.standing))
@@ -197,7 +197,8 @@ def test_footholds_rotate_with_the_body() -> None:
 
 @pytest.mark.parametrize("mesh", [stool, figure, biped, block_mesh])
 def test_the_planned_pressure_is_under_the_standing_feet(mesh: Callable[[], TetMesh]) -> None:
-    """The centre of pressure of the first swing lies under the feet that stand during it; the whole plan is bounded."""
+    """The centre of pressure of the first swing lies within the support polygon of the feet that stand during it, and
+    the planned divergent component is bounded."""
     place = coarse_creature(mesh(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, straight_route(0.3), 0.06)
     walk._advance_phase(place.ground.local(place.standing), None, 0.0)
@@ -210,7 +211,7 @@ def test_the_planned_pressure_is_under_the_standing_feet(mesh: Callable[[], TetM
         np.concatenate([walk._planner.soles[index, :2] + walk._planner.grips[index] for index in stands])
     )
     assert under.margin(swing) >= -1e-9
-    if len(lifted) == 1:  # the diagonals of four feet cross
+    if len(lifted) == 1:  # with four feet, the diagonals of swinging and standing feet cross
         other = walk._planner.soles[lifted[0], :2] + walk._planner.grips[lifted[0]]
         assert SupportPolygon.hull(other).margin(swing) < 0.0
     reach = 0.3 + np.ptp(place.standing[:, :2], axis=0)
@@ -218,8 +219,8 @@ def test_the_planned_pressure_is_under_the_standing_feet(mesh: Callable[[], TetM
 
 
 def test_a_narrow_body_leans_in_the_direction_of_travel() -> None:
-    """The rear edge of the support gets a minimum distance from the centre of mass, once the body has turned to walk to
-    its left; nothing changes for a wide support, and the body ends upright."""
+    """The body is shifted ahead so that the rear edge of the support has a minimum distance from the centre of mass.
+    The shift is along the heading, here to the left, zero for a wide support, and undone at the end."""
     place = block_place(biped())
     com = place.body.centre_of_mass(place.ground.local(place.standing))
     narrow = replace(place, contact_points=0.35 * place.contact_points)
@@ -236,7 +237,7 @@ def test_a_narrow_body_leans_in_the_direction_of_travel() -> None:
 
 
 def test_a_crouch_begins_and_ends_while_all_feet_stand() -> None:
-    """It is reached while the weight shifts, kept during the steps, and left while the feet gather."""
+    """The crouch is assumed while the weight shifts, held during the steps, and left while the feet gather."""
     place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, straight_route(0.1), 0.1, crouch=0.8)
     standing = float(place.body.centre_of_mass(place.ground.local(place.standing))[2])

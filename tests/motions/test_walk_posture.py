@@ -58,8 +58,8 @@ def test_legs_follow_their_feet() -> None:
 
 
 def test_a_base_rotates_and_tips_with_its_sides() -> None:
-    """Moving one side forward rotates the body about the other side, lifting it tips the body; the centres of the sides
-    are near their targets, and the centre of mass is at its target."""
+    """If one side of the base moves forward, the body rotates about the other side; if a side is lifted, the body tips.
+    The centres of the sides are near their targets, and the centre of mass is at its target."""
     place = block_place()
     standing, feet, carriage, soles = carried(place)
     assert isinstance(carriage, RockingPosture) and len(feet) == 2
@@ -95,7 +95,7 @@ def test_a_base_rotates_and_tips_with_its_sides() -> None:
 
 
 def test_a_lying_body_has_no_feet() -> None:
-    """A long bar on the ground has none; a body with short joined feet uses these as the sides of a base."""
+    """A long bar on the ground has no feet. The base of a block is divided into two feet."""
     place = block_place()
     lying = replace(place, standing=place.standing[:, [2, 0, 1]] * [4.0, 0.3, 0.3])
     feet, _ = select_posture(replace(place, standing=place.standing))
@@ -118,5 +118,6 @@ def on_blocks(count: int, tall: float) -> TetMesh:
 
 @pytest.mark.parametrize(("count", "tall", "swings"), [(3, 0.3, False), (3, 0.6, True), (4, 0.3, True)])
 def test_a_stump_is_no_leg_of_few_feet(count: int, tall: float, swings: bool) -> None:
-    """A leg wider than long cannot reach the point where a fall is caught; with four or more feet, the others stand."""
+    """A leg that is wider than long cannot reach the capture point, so a body on three of them does not swing its legs.
+    With four or more feet, the other feet support the body."""
     assert (select_posture(block_place(on_blocks(count, tall)))[1] is LeggedPosture) is swings

@@ -1,4 +1,4 @@
-"""Muscles from JSON, and the picture of a body's muscles."""
+"""Muscles from JSON files, and the plot of a body's muscles."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.meshes import block_mesh
 
 UP = np.array([0.0, 0.0, 1.0])
 MESH = block_mesh(5, 5, 11)
-"""A column of 0.4 x 0.4 x 1 standing on z = 0."""
+"""Column of 0.4 x 0.4 x 1 m that stands on z = 0."""
 
 STRAIGHT = {"name": "back", "kind": "longitudinal", "from": [0.1, 0, 0.1], "to": [0.1, 0, 0.9]}
 HOOP = {"name": "belt", "kind": "circular", "centre": [0, 0, 0.5], "axis": [0, 0, 2], "radius": 0.12}
@@ -132,7 +132,8 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_plot_shows_each_kind_in_its_colour(tmp_path: Path) -> None:
-    """Three views are side by side; the colour of a kind appears exactly if the body has fibres of that kind."""
+    """The plot has three views side by side. The colour of a kind of fibre appears if and only if the body has fibres
+    of that kind."""
     red, green = np.array([60, 60, 210]), np.array([60, 160, 60])
 
     def seen(image: np.ndarray, colour: np.ndarray) -> int:

@@ -1,4 +1,4 @@
-"""Muscle columns (Eq. 7) and how fibres attach to the body."""
+"""Muscles: columns of the activation Jacobian (Eq. 7), attachments, and the motions that each kind of fibre causes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def random_muscles(rng: np.random.Generator) -> MuscleSet:
 @settings(max_examples=examples(15))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_columns_make_no_net_force_or_torque(seed: int) -> None:
-    """Eq. (7): in any pose, the nodal forces of every column have no sum and no torque."""
+    """Eq. (7): in any pose, the nodal forces of every column have zero resultant force and torque."""
     rng = np.random.default_rng(seed)
     muscles = random_muscles(rng)
     positions = COLUMN.nodes + rng.normal(0.0, 0.05, COLUMN.nodes.shape) + rng.normal(0.0, 1.0, 3)
@@ -76,7 +76,8 @@ def test_positive_activation_contracts() -> None:
 
 
 def test_bounds_and_strength() -> None:
-    """|a_j| <= s_max L_j and k_j = F_max / (s_max L_j): at its bound a segment has the strength of its fibre."""
+    """The bounds are abs(a_j) <= s_max L_j and the stiffness is k_j = F_max / (s_max L_j): at its bound, a segment has
+    the strength of its fibre."""
     fibre = Fibre("spine", FibreKind.LONGITUDINAL, np.array([[0.0, 0.0, 0.2], [0.0, 0.0, 0.5], [0.0, 0.0, 0.9]]), 7.0)
     muscles = attach_fibres(COLUMN, [fibre], max_strain=0.25)
     np.testing.assert_allclose(muscles.rest_lengths, [0.3, 0.4], rtol=0.03)
@@ -96,7 +97,8 @@ def test_attachments_spread_and_keep_their_centroid() -> None:
 
 
 def test_attachments_do_not_cross_gaps() -> None:
-    """A point in one of two adjacent legs never has weights on nodes of the other, even within reach."""
+    """A point in one of two adjacent legs has weights only on nodes of that leg, even if the other leg is close
+    enough."""
     bar = box_mesh((9, 2, 9), (0.9, 0.2, 0.9))
     centres = bar.nodes[bar.tets].mean(axis=1)
     arch = bar.tets[(centres[:, 2] > 0.6) | (np.abs(centres[:, 0]) > 0.05)]
@@ -130,13 +132,14 @@ def column_muscles(column_body: SoftBody) -> MuscleSet:
 
 
 def linear_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray) -> np.ndarray:
-    """(N, 3) static displacement when ``segments`` contract by 2 % of their lengths and the base is clamped."""
+    """Return the static displacement (N, 3), m, of a body with a clamped base if ``segments`` contract by 2 % of their
+    lengths."""
     return static_response(body, muscles, segments, 0.02, COLUMN.nodes[:, 2:] <= 1e-9)
 
 
 def free_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray, share: float) -> np.ndarray:
-    """Return the displacement (N, 3) of a free body contracted by ``share``; six degrees of freedom at three corners
-    are fixed against drift."""
+    """Return the displacement (N, 3), m, of a free body if ``segments`` contract by the fraction ``share`` of their
+    lengths. Six degrees of freedom at three corners are fixed to exclude rigid motions."""
     low, ahead, aside = (
         int(np.argmin(np.linalg.norm(COLUMN.nodes - corner, axis=1)))
         for corner in ([-0.2, -0.2, 0.0], [0.2, -0.2, 0.0], [-0.2, 0.2, 0.0])
@@ -151,8 +154,8 @@ def free_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray, shar
 def static_response(
     body: SoftBody, muscles: MuscleSet, segments: np.ndarray, share: float, held: np.ndarray
 ) -> np.ndarray:
-    """Return the linear displacement (N, 3) under a contraction by ``share``, with the degrees of freedom ``held`` (N,
-    3) or (N, 1) fixed.
+    """Return the linear displacement (N, 3), m, if ``segments`` contract by the fraction ``share`` of their lengths,
+    with the degrees of freedom ``held`` (N, 3) or (N, 1) fixed.
     """
     upper = body.assembly.matrix(body.assembly.hessian_entries(COLUMN.nodes))
     stiffness = (upper + sparse.triu(upper, 1).T).tocsc()
@@ -173,17 +176,18 @@ def twist(moved: np.ndarray) -> float:
 
 
 def rise(moved: np.ndarray) -> float:
-    """Mean upward displacement of the upper half, metres."""
+    """Return the mean upward displacement of the upper half, m."""
     return float(moved[COLUMN.nodes[:, 2] > 0.5, 2].mean())
 
 
 def lean(moved: np.ndarray) -> np.ndarray:
-    """(2,) mean horizontal displacement of the upper half, metres."""
+    """Return the mean horizontal displacement (2,) of the upper half, m."""
     return moved[COLUMN.nodes[:, 2] > 0.5, :2].mean(axis=0)
 
 
 def test_longitudinal_fibres_shorten_and_on_one_side_bend(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7): all of them together lower the top without leaning; those on +x alone lean it towards +x.
+    """Eq. (7): all longitudinal fibres together lower the upper half without a lean; the fibres on +x alone make it
+    lean towards +x.
 
     See docs/concepts/muscles.md.
     """
@@ -200,8 +204,8 @@ def test_longitudinal_fibres_shorten_and_on_one_side_bend(column_body: SoftBody,
 
 
 def test_radial_fibres_lengthen_by_poissons_ratio(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7), docs/concepts/muscles.md: a free body that is compressed by its radial fibres grows by exactly nu sum(T
-    L) / (E V); with a clamped base its top rises.
+    """Eq. (7), docs/concepts/muscles.md: the mean axial strain of a free body that is compressed by its radial fibres
+    is exactly nu sum(T L) / (E V); with a clamped base, its upper half rises.
 
     Forces in equilibrium have the mean stress sum(f x^T) / V, which is -T L along each segment of length L and tension
     T; the mean axial strain is -nu / E times the two lateral stresses.
@@ -225,8 +229,8 @@ def test_radial_fibres_lengthen_by_poissons_ratio(column_body: SoftBody, column_
 
 
 def test_radial_fibres_are_diameters_spread_over_length_and_directions(column_muscles: MuscleSet) -> None:
-    """Fibres are level, pass through the axis, and extend to 0.7 of the half-width on both sides; their directions are
-    evenly spread on each level.
+    """Fibres are horizontal, pass through the axis, and extend to 0.7 of the half-width on both sides; their directions
+    are evenly distributed on each level.
     """
     ends = column_muscles.end_points(COLUMN.nodes)[
         column_muscles.segments[column_muscles.segments_of_kind(FibreKind.RADIAL)]
@@ -245,7 +249,8 @@ def test_radial_fibres_are_diameters_spread_over_length_and_directions(column_mu
 
 
 def test_oblique_fibres_twist_by_their_hand_and_hoops_do_not(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7): right- and left-handed helices twist in opposite directions; hoops and radial fibres hardly at all.
+    """Eq. (7): right- and left-handed helices twist the body in opposite directions; hoops and radial fibres hardly
+    twist it.
 
     A right-handed helix that contracts unwinds: seen from above, its upper end rotates clockwise (negative).
 
@@ -276,8 +281,8 @@ def test_hoops_make_no_axial_torque_between_halves(column_muscles: MuscleSet) ->
 
 
 def test_automatic_muscles_of_a_column(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Every kind exists, is mirrored and reaches the ground all around, within the budget; two calls give the same
-    bits."""
+    """A column gets fibres of every kind, each with a mirrored partner, within the budget of segments. The longitudinal
+    fibres are distributed all around, and two calls give the same bits."""
     muscles = column_muscles
     assert set(muscles.fibre_kinds) == set(FibreKind) - {FibreKind.USER}
     assert 60 <= muscles.segment_count <= 112

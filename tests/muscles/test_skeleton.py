@@ -16,7 +16,7 @@ from tests.support.meshes import UP, carved, column, figure, stool
 
 
 def test_ascent_is_height_on_a_column() -> None:
-    """The drainage field of an upright prism depends on height alone, so phi is the height itself."""
+    """The drainage field of an upright prism depends only on the height, so the ascent equals the height."""
     mesh = column()
     np.testing.assert_allclose(geodesic_height(mesh, UP), mesh.nodes[:, 2], atol=0.04)
     assert set(base_nodes(mesh, UP)) == set(np.flatnonzero(mesh.nodes[:, 2] < 1e-9))

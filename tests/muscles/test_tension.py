@@ -1,4 +1,4 @@
-"""Muscle energy: derivatives, Eq. (7), a step under tension, and the slender column that a dead load buckles."""
+"""Muscle energy: derivatives, Eq. (7), a step under tension, and buckling of a slender rod."""
 
 from __future__ import annotations
 
@@ -30,26 +30,27 @@ def rod() -> SoftBody:
 
 
 def tendon(count: int) -> MuscleSet:
-    """One fibre of ``count`` segments up the middle of the rod."""
+    """Create one fibre of ``count`` segments along the axis of the rod."""
     points = np.stack([np.zeros(count + 1), np.zeros(count + 1), np.linspace(0.05, 0.95, count + 1)], axis=1)
     return attach_fibres(ROD, [Fibre("spine", FibreKind.LONGITUDINAL, points, 1.0)])
 
 
 def scattered(rng: np.random.Generator) -> MuscleEnergy:
-    """Segments across the rod, with positive and negative tensions."""
+    """Create random segments with positive and negative tensions."""
     points = rng.uniform([-0.03, -0.03, 0.1], [0.03, 0.03, 0.9], (6, 4, 3))
     muscles = attach_fibres(ROD, [Fibre(f"f{i}", FibreKind.USER, p, 5.0 + i) for i, p in enumerate(points)])
     return MuscleEnergy.of(muscles, rng.uniform(-1.0, 1.0, muscles.segment_count) * muscles.bounds)
 
 
 def dense(tension: MuscleEnergy, x: np.ndarray) -> np.ndarray:
-    """(3N, 3N) stiffness of all segments."""
+    """Return the stiffness matrix (3N, 3N) of all segments, N/m."""
     across, rates = tension.hessian(x).factors(min_relative_stiffness=0.0)
     return (across * rates) @ across.T
 
 
 def test_segments_of_a_compressed_rod_are_shorter() -> None:
-    """The rod is compressed by a tenth of its length, under any translation and rotation."""
+    """A rod that is compressed by a tenth of its length, rotated and translated has segments that are shorter by a
+    tenth."""
     muscles, turned = tendon(3), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     pressed = (ROD.nodes * [1.0, 1.0, 0.9]) @ turned.T + [1.0, 2.0, 3.0]
     np.testing.assert_allclose(shortening(muscles, ROD.nodes, pressed), 0.1 * muscles.rest_lengths, rtol=1e-9)
@@ -58,8 +59,8 @@ def test_segments_of_a_compressed_rod_are_shorter() -> None:
 
 @pytest.mark.parametrize("shortened", [1.0, 0.55, 0.2], ids=["long", "short", "slack"])
 def test_force_and_stiffness_are_derivatives_of_the_energy(shortened: float) -> None:
-    """Central differences; the low-rank factors leave out only the slackest segments. Below 0.7 of the rest length the
-    tension decreases, below 0.3 it is zero.
+    """Force and stiffness equal central differences. The low-rank factors omit only the slackest segments. The tension
+    decreases below 0.7 of the rest length and is zero below 0.3.
     """
     rng = np.random.default_rng(0)
     tension = scattered(rng)
@@ -80,11 +81,12 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(shortened: float) -> 
 
 @pytest.mark.parametrize("shortened", [1.0, 0.55, 0.2, 0.0], ids=["long", "short", "slack", "in a point"])
 def test_the_kernel_adds_the_force_to_that_of_the_elements(rod: SoftBody, shortened: float) -> None:
-    """Eq. (7): the sum is that of ``gradient`` to rounding, for one set of muscles after another."""
+    """Eq. (7): the sum of elastic and muscle forces equals ``gradient`` to rounding, for several sets of muscles in
+    turn."""
     rng = np.random.default_rng(3)
     x = ROD.nodes + rng.normal(0.0, 0.002, ROD.nodes.shape)
     for tension in (scattered(rng), MuscleEnergy.of(tendon(5), rng.normal(size=5)), scattered(rng)):
-        # The segments have the lengths of shorter ones at rest.
+        # Longer rest lengths shorten the segments relative to rest.
         held = MuscleEnergy(tension.rows, tension.tensions, tension.rest_lengths / max(shortened, 1e-9))
         forces = rod.assembly.gradient(x, None, held) - rod.assembly.gradient(x)
         expected = held.gradient(x)
@@ -94,8 +96,8 @@ def test_the_kernel_adds_the_force_to_that_of_the_elements(rod: SoftBody, shorte
 
 
 def test_full_tension_has_the_energy_of_its_length() -> None:
-    """V = sum T L plus a constant if no segment is shorter than 0.7 of its rest length, so the force is that of Eq.
-    (7). Between 0.3 and 0.7 the work is half of that of a full tension, and below it is zero.
+    """The energy is sum T L plus a constant if no segment is shorter than 0.7 of its rest length, so the force is that
+    of Eq. (7). Between 0.3 and 0.7, the work is half of the work at full tension; below 0.3 it is zero.
     """
     muscles = tendon(5)
     activations = np.linspace(0.1, 0.3, 5) * muscles.bounds
@@ -112,7 +114,7 @@ def test_full_tension_has_the_energy_of_its_length() -> None:
 
 
 def test_force_is_equation_7_and_makes_no_net_force_or_torque() -> None:
-    """Eq. (7): the force is A(p) a in any pose."""
+    """Eq. (7): in any pose, the force is A(p) a, with zero resultant force and torque."""
     rng = np.random.default_rng(1)
     muscles = tendon(5)
     activations = rng.uniform(-1.0, 1.0, 5) * muscles.bounds
@@ -206,8 +208,8 @@ def press(rod: SoftBody, load: float, *, follows: bool) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_tendon_holds_straight_the_rod_that_a_dead_load_buckles(rod: SoftBody) -> None:
-    """A tendon inside a rod cannot buckle it, because its thrust bends with the rod; with its direction frozen over a
-    step it does.
+    """A tendon inside a rod cannot buckle it, because the tension follows the bend of the rod. A load of the same size
+    with a fixed direction buckles it.
     """
     second_moment, length = 0.08**4 / 12, 0.9
     euler = np.pi**2 * rod.young_modulus * second_moment / (4 * length**2)
@@ -221,8 +223,8 @@ def test_a_tendon_holds_straight_the_rod_that_a_dead_load_buckles(rod: SoftBody)
 def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
     rod: SoftBody, share: float, dt: float
 ) -> None:
-    """A free rod compressed by its tendon with ``share`` of Euler's load, below and above it, against dense
-    matrices."""
+    """A free rod is compressed by its tendon with ``share`` times Euler's buckling load. The tangent equals dense
+    matrices below and above this load, where the elastic part is indefinite."""
     euler = np.pi**2 * rod.young_modulus * 0.08**4 / 12 / 0.9**2
     tension = MuscleEnergy(tendon(6).difference_rows, np.full(6, share * euler), tendon(6).rest_lengths)
     still = np.zeros_like(ROD.nodes)
@@ -242,7 +244,7 @@ def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
     right = np.random.default_rng(3).standard_normal((whole.shape[0], 4))
     tangent = problem.tangent(MultifrontalLdl(rod.assembly.upper_pattern), still, tension)
     found = tangent.solve(right)
-    # Apart from the rigid rotation that conserves the angular momentum.
+    # The solutions differ by the rigid rotation that conserves the angular momentum.
     turned = problem.momenta.T
     missing = right - whole @ found
     missing = missing - turned @ np.linalg.lstsq(turned, missing, rcond=None)[0]
@@ -251,8 +253,8 @@ def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
 
 
 def test_impulses_of_groups_are_the_columns_of_their_muscles() -> None:
-    """Eq. (7) at the bounds, times the step size, for a body bent until some segments lose tension; with one
-    muscle per group, and with several."""
+    """The impulse of a group is the sum of the columns (Eq. 7) of its muscles at their bounds, times the step size, for
+    one and for several muscles per group, at rest and in a deformed body with slack segments."""
     creature = coarse_pawn()
     muscles, rest = creature.muscles, creature.body.mesh.nodes
     bent = rest * [1.0, 1.0, 0.6] + 0.01 * np.random.default_rng(0).standard_normal(rest.shape)

@@ -1,4 +1,5 @@
-"""Failures of the machine during a run: the simulation is kept, and no file is partial or from another run."""
+"""``animate``: files of a run, and failures of the machine, after which the simulation is kept and no file is partial
+or from another run."""
 
 from __future__ import annotations
 
@@ -37,20 +38,20 @@ OPTIONS = AnimateOptions(frames=2, size=32, creature=CreatureOptions(friction=0.
 
 @cache
 def thing() -> BuiltInObject:
-    """A pawn of few Gaussians."""
+    """Create a pawn of few Gaussians."""
     return pawn(gaussian_count=2000, device="cpu")
 
 
 @pytest.fixture(scope="module")
 def performance() -> SimulatedRun:
-    """A simulated run of a coarse pawn with two frames."""
+    """Simulate two frames of a jump of a coarse pawn."""
     creature = make_creature(thing().cloud, plane=thing().plane, options=CreatureOptions(friction=0.6, nodes=120))
     return simulate(creature, motion("jump"), frames=2)
 
 
 @pytest.fixture
 def run(performance: SimulatedRun, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Report]:
-    """``animate`` without the simulation."""
+    """Return ``animate`` with the finished simulation in place of a new one."""
     monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", lambda *_, **__: performance.creature)
     monkeypatch.setattr("egs_warp.pipelines.takes.simulate", lambda *_, **__: performance)
 
@@ -93,7 +94,7 @@ def test_a_preview_is_small_and_keeps_all_gaussians_for_later(
     preview = replaced(OPTIONS, preview=True)
     report = animate(thing().cloud, tmp_path, plane=thing().plane, options=preview, quiet=True, show_note=notes.append)
     data = RenderData.load(tmp_path / "creature.npz", node_count=len(performance.creature.cage.mesh.nodes))
-    # The deformer of all Gaussians only makes the embedding that the file stores.
+    # The deformer of all Gaussians is created only for the embedding that the file stores.
     assert drawn == [data.splats.count, 100] and data.splats.count >= thing().cloud.count
     assert (data.camera.width, data.camera.height) == (24, 24)
     assert notes[-1] == report.notes[-1]
@@ -117,7 +118,7 @@ def test_a_film_that_fails_leaves_the_simulation(
 def test_a_run_that_is_cut_off_leaves_its_steps(
     run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The simulated steps are read from the parts; the next run moves them aside."""
+    """The simulated steps of an interrupted run can be read from its parts; the next run moves them aside."""
     monkeypatch.setattr("egs_warp.locomotion.recorder._MIN_STEPS_PER_PART", 7)
     slid = slide()
 
@@ -150,7 +151,7 @@ def test_a_film_from_straight_above_or_below(performance: SimulatedRun, side: fl
 
 
 def test_of_several_views_the_nearest_to_the_default_is_filmed(performance: SimulatedRun) -> None:
-    """The default view shows the face and the path."""
+    """The camera takes the one of seven view directions that is nearest to the default view."""
     first, second = thing().plane.tangents()
     around = 2.0 * np.pi * (np.arange(7)[:, None] + 0.3) / 7
     ways = np.cos(around) * first + np.sin(around) * second + 0.5 * thing().plane.normal
@@ -173,9 +174,9 @@ def test_a_missing_ffmpeg_is_reported_first(
 def test_a_disk_that_is_full_at_any_file(
     run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each opening and each renaming of a file fails once in turn: there is a one-line error, no temporary file, and
-    the run does not count as finished. In every fourth case, the next run moves it aside. Plotting is replaced, because
-    forty plots would take most of a minute.
+    """Each opening and each renaming of a file fails once in turn. The error is one line, no temporary file is left,
+    and the run does not count as finished. In every fourth case, the next run moves it aside. Plotting is replaced by a
+    stub to save time.
     """
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"plots"))
     failures = 0

@@ -1,4 +1,4 @@
-"""Short stand that checks the muscles of a file."""
+"""Check, by a short simulated stand, whether the muscles of a file hold the body upright."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.creatures import coarse_pawn
 
 
 def test_a_body_that_falls_over_is_reported_and_one_that_stands_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A hard push is beyond any muscles. The check leaves no trace in the run that follows."""
+    """A body that is pushed too hard for its muscles gets a note. The check does not change the following run."""
     creature = coarse_pawn()
     before = simulate(creature, motion("jump"), frames=3).trajectory
     monkeypatch.setattr(balance, "_STAND_TIME", 0.3)

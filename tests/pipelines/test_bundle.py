@@ -64,7 +64,8 @@ def _deformer_of(body: BundleBody) -> Deformer:
 def test_the_reader_agrees_with_the_deformer(run: FinishedRun, tmp_path: Path) -> None:
     """Nodes are displaced at random, so that many splats extend across tetrahedra with different deformation.
 
-    On the content of the file, the agreement is that of single precision; with the run, that of the stated errors.
+    Reader and deformer agree to single precision for the content of the file, and to the errors stated in the file for
+    the run.
     """
     rng = np.random.default_rng(2)
     t = run.trajectory

@@ -1,4 +1,4 @@
-"""Warnings about bodies that the user may not expect."""
+"""Warnings about captures whose body may not be what the user expects."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def test_a_file_has_the_ending_of_its_kind_and_one_frame(
 def test_an_interrupted_run_is_resumed_and_not_exported(
     run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """The files in its folder do not matter: the film may be the missing one."""
+    """An interrupted run is refused whatever files its folder contains, because only the film may be missing."""
     folder = tmp_path / "run"
     shutil.copytree(run.folder, folder)
     manifest = json.loads((folder / MANIFEST).read_text()) if (folder / MANIFEST).is_file() else {"files": {}}
@@ -230,7 +230,7 @@ def test_frames_are_not_put_among_the_files_of_a_run(
 
 
 def test_nvidias_validator_for_splats_finds_nothing(run: FinishedRun, tmp_path: Path):
-    """Rule VG.035 of the Omniverse asset requirements."""
+    """NVIDIA's validator checks rule VG.035 of the Omniverse asset requirements and reports no issue."""
     validator = pytest.importorskip("omni.asset_validator")
     path = tmp_path / "run.usdc"
     export_usd(run, path, every=6, quiet=True)

@@ -42,7 +42,7 @@ def thing(request: pytest.FixtureRequest) -> BuiltInObject:
 
 @pytest.fixture(scope="module")
 def standing(thing: BuiltInObject) -> PlacedCage:
-    """The cage in the original orientation of the file."""
+    """Create the cage in the original orientation of the file."""
     return place_cage(thing.cloud, plane=thing.plane, nodes=200)
 
 
@@ -50,7 +50,8 @@ def standing(thing: BuiltInObject) -> PlacedCage:
 def test_a_figurine_faces_its_face_and_a_stool_away_from_its_back(
     thing: BuiltInObject, standing: PlacedCage, turn: list[float] | None
 ) -> None:
-    """In any orientation of the file; the message gives the direction in the file, and the reason."""
+    """The facing direction is correct in any orientation of the file; the message gives it in the axes of the file,
+    with the reason."""
     way = DOWN
     if turn is not None:
         axes = Rotation.from_rotvec(turn).as_matrix()
@@ -96,7 +97,7 @@ def test_a_box_without_features_has_an_alternative() -> None:
 
 
 def test_a_head_leans_ahead_and_a_back_leans_behind() -> None:
-    """The upper part of a cow is a plate along its trunk; its top is the head alone."""
+    """The top part of a body has its centre ahead for the head of a cow, and behind for the back of a chair."""
 
     def cow(centres: np.ndarray) -> np.ndarray:
         x, y, z = centres.T
@@ -115,7 +116,7 @@ def test_a_head_leans_ahead_and_a_back_leans_behind() -> None:
 
 @pytest.mark.slow
 def test_photos_from_one_side_determine_the_front() -> None:
-    """A box without features has no front of its own."""
+    """A box without features faces the side from which it was photographed."""
     box = plain_box(0.9, 0.5)
     standing = place_cage(box.cloud, plane=box.plane, nodes=200)
     for side in (1.0, -1.0):

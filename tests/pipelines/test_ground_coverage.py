@@ -24,7 +24,8 @@ def box(x: float, lift: float = 0.0) -> np.ndarray:
 
 @pytest.mark.parametrize(("x", "share"), [(0.0, 1.0), (0.99, 0.6), (1.6, 0.0)])
 def test_fraction_of_the_feet_over_ground(x: float, share: float) -> None:
-    """On the table, over its edge (three of five columns of nodes are on it), and beyond it, over a floor far below."""
+    """The box is on the table, over its edge with three of its five columns of nodes on it, or beyond it, over a floor
+    far below."""
     assert share_over_ground(box(x), TABLE, FLAT, 1.0) == pytest.approx(share)
 
 
@@ -47,7 +48,7 @@ def test_messages() -> None:
 
 
 def test_coverage_on_uneven_ground() -> None:
-    """On a slope, both body and splats are higher to the right."""
+    """The ground is a slope, on which body and splats are higher to the right."""
     heights = np.tile(0.2 * np.linspace(-2.0, 2.0, 41), (41, 1))
     field = HeightField.through(np.eye(3), np.array([-2.0, -2.0, 0.0]), 0.1, heights)
     points = level((-2.0, -1.0), (1.0, 1.0), 0.0, 0.03)

@@ -21,7 +21,7 @@ from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.pipelines.info import BodyInfo, draw_info, inspect_capture
 
 COLOURS = {1: (0xD6, 0x27, 0x28), 2: (0x1F, 0x77, 0xB4), 3: (0x2C, 0xA0, 0x2C), 4: (0xFF, 0x7F, 0x0E)}
-"""Colours of the feet in the picture."""
+"""RGB colours of the feet in the image, by the number of the foot."""
 
 
 def inspected(thing: BuiltInObject) -> BodyInfo:
@@ -36,7 +36,7 @@ def chair() -> BodyInfo:
 
 
 def test_a_chair_is_described_by_its_measurements(chair: BodyInfo) -> None:
-    """Feet in the order of their numbers: front right and left, back right and left; lengths in body heights."""
+    """The feet are numbered anticlockwise from straight ahead; lengths of legs are in body heights."""
     assert chair.base is SupportKind.FEET and len(chair.feet) == 4
     soles = chair.soles() / chair.body.height
     assert np.sign(soles[:, :2]).astype(int).tolist() == [[1, 1], [-1, 1], [-1, -1], [1, -1]]
@@ -77,7 +77,7 @@ def test_the_picture_has_every_foot_in_its_colour(chair: BodyInfo, tmp_path: Pat
 
 
 def snake() -> GaussianCloud:
-    """A bar whose length is ten times its height."""
+    """Create a bar whose length is ten times its height."""
     rng = np.random.default_rng(0)
     points = rng.uniform(size=(5000, 3)) * [1.0, 0.1, 0.1] - [0.5, 0.05, 0.0]
     count = len(points)
@@ -97,7 +97,7 @@ def test_a_lying_body_has_no_feet_and_is_drawn(tmp_path: Path) -> None:
 
 
 def test_a_body_above_the_ground_is_refused() -> None:
-    """A cube, half its height above the ground."""
+    """A cube that hangs half of its height above the ground is refused."""
     random = np.random.default_rng(0)
     means = random.uniform(-0.3, 0.3, (4000, 3))
     means[np.arange(4000), np.arange(4000) % 3] = 0.3 * random.choice([-1.0, 1.0], 4000)

@@ -1,5 +1,5 @@
-"""A creature does not depend on the frame of its file: muscles, contacts and first steps are bitwise equal; a jump and
-its images are equal within tolerances, in any unit and orientation.
+"""Independence of a creature of the frame of its file. In other orders, positions and units of a power of two, the
+first steps are bitwise equal. In any unit and orientation, a jump and its images are equal within tolerances.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ WHERE_IT_LIES = {"body_axes", "body_origin", "metres_per_unit"}
 
 
 def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, RolloutResult]:
-    """Simulate a jump, or its first ``frames`` frames; the plane is given, or found from up alone."""
+    """Simulate a jump, or its first ``frames`` frames, with the given plane or, if ``by_up``, only the up direction."""
     if by_up:
         creature = make_creature(lying.cloud, up=lying.up)
     else:
@@ -66,7 +66,7 @@ def first_steps(thing: Lying) -> tuple[Creature, RolloutResult]:
 
 @pytest.fixture(scope="module")
 def elsewhere(thing: Lying) -> tuple[Lying, Creature, RolloutResult]:
-    """The same capture and jump, translated, rotated and in another unit, with the plane given."""
+    """Simulate the first steps of the jump for the capture after translation, rotation and scaling, with its plane."""
     lying = thing.moved((3.0, 1.0, -2.0)).turned().scaled(0.37)
     return lying, *jump(lying, frames=3)
 
@@ -123,7 +123,7 @@ def test_same_images_from_up_alone(
 
 
 def test_a_trajectory_maps_back_to_the_capture(elsewhere: tuple[Lying, Creature, RolloutResult]) -> None:
-    """The nodes at the start are at the Gaussians, on the plane of the capture."""
+    """In the axes of the capture, the nodes at the start have the extent of the Gaussians and stand on its plane."""
     turned, _, simulation = elsewhere
     trajectory = simulation.trajectory
     nodes, means = trajectory.in_capture(trajectory.rest_positions), turned.cloud.means.numpy()
@@ -135,8 +135,8 @@ def test_a_trajectory_maps_back_to_the_capture(elsewhere: tuple[Lying, Creature,
 
 
 LIMIT = 0.01
-"""Tolerance of distance and height. All these cases give the bits of the first; a single contact point of some 10,000
-that is rounded differently may change the jump by up to 2 %.
+"""Relative tolerance of distance and height. All cases should have the bits of the first one; if a single one of some
+10,000 contact points is rounded differently, the jump may change by up to 2 %.
 """
 CHANGES: dict[str, Callable[[Lying], Lying]] = {
     "x0.37": lambda thing: thing.scaled(0.37),
@@ -147,7 +147,7 @@ CHANGES: dict[str, Callable[[Lying], Lying]] = {
 
 
 def assert_same_jump(lying: Lying, other: Lying, *, by_up: bool = False) -> None:
-    """Assert equal distance and height, and equal pictures at the end and at the highest point."""
+    """Assert that distance and height are equal, and the images at the end and at the highest point."""
     (creature, first), (again, second) = (jump(one, by_up=by_up) for one in (lying, other))
     reached, its = measure(first.trajectory), measure(second.trajectory)
     for name in ("distance", "height"):

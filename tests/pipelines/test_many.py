@@ -27,7 +27,7 @@ from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn
 
 FRAMES, FEW = 31, 11
-"""Numbers of frames: 30 steps after the first frame, and 10 where nothing new happens later."""
+"""Numbers of frames of long and of short jobs: the first frame plus 30 or 10 steps."""
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def creature() -> Creature:
 
 @pytest.fixture(scope="module")
 def jobs(creature: Creature) -> list[Job]:
-    """Jobs with their own target, friction, style, push or activations, and two invalid ones."""
+    """Return jobs that differ in target, friction, style, push or activations, and two invalid ones."""
     count = creature.muscles.segment_count
     held = 0.1 * np.sin(np.arange(10.0)[:, None] + np.arange(count)) * creature.muscles.bounds
     return [
@@ -124,8 +124,8 @@ def test_progress_ends_at_the_total(progress_calls: list[tuple[int, int]], outco
 
 @pytest.mark.slow
 def test_worlds_of_a_batch_equal_single_runs(creature: Creature, tmp_path: Path) -> None:
-    """Jobs of two step sizes, on three grounds, one longer than the others, beside one that runs in a worker and two
-    invalid ones: trajectories agree to 1e-9 body heights, in the order of the jobs."""
+    """The jobs have two step sizes, three grounds and different lengths; one runs in a worker, and two are invalid. All
+    trajectories agree with single runs to 1e-9 body heights, in the order of the jobs."""
     count = creature.muscles.segment_count
     held = 0.3 * np.sin(np.arange(6.0)[:, None] + np.arange(count)) * creature.muscles.bounds
     asked = motion("stand 1")
@@ -169,7 +169,8 @@ def test_worlds_of_a_batch_equal_single_runs(creature: Creature, tmp_path: Path)
 
 
 def test_a_batch_too_large_for_a_gpu_is_halved(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
-    """There is memory for two of four requested worlds; then for none, which each result reports in a line."""
+    """With memory for two of four requested worlds, the batch is halved; with memory for none, each result reports it
+    in one line."""
     room, asked = 2, []
 
     class Cramped(BatchStepper):
@@ -218,7 +219,7 @@ def test_trajectories_may_be_written_to_a_folder(creature: Creature, tmp_path: P
 
 
 def test_a_creature_can_be_pickled(creature: Creature) -> None:
-    """A creature that is read from its pickle moves identically and has the same splats."""
+    """A pickled copy of a creature moves identically and has the same splats."""
     other: Creature = pickle.loads(pickle.dumps(creature))
     asked = motion("jump")
     assert same(simulate(other, asked, frames=5).trajectory, simulate(creature, asked, frames=5).trajectory)
@@ -238,8 +239,8 @@ def test_a_changed_ground_equals_that_of_a_new_creature(creature: Creature) -> N
 
 
 def test_activations_of_a_run_reproduce_it(creature: Creature) -> None:
-    """10 recorded steps are reproduced approximately: with prescribed activations, contact points are selected
-    differently."""
+    """A run with the recorded activations of 10 steps agrees to 1e-3 body heights. It is not exact, because contact
+    points are selected differently if the activations are prescribed."""
     first = simulate(creature, motion("jump"), frames=11)
     assert all(report.dt == first.simulation.reports[0].dt for report in first.simulation.reports)
     again = simulate(creature, motion("jump"), activations=first.trajectory.activations)

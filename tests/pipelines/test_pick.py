@@ -36,7 +36,7 @@ EACH = 1500
 
 @pytest.fixture(scope="module")
 def apart() -> ClickGraph:
-    """Two balls with a gap between them on a floor."""
+    """Create two balls with a gap between them on a floor."""
     return ClickGraph.of(balls((-0.6, 0.9), between=1.6))
 
 
@@ -139,7 +139,7 @@ def test_warnings_name_a_remedy(apart: ClickGraph):
 
 
 def test_surroundings_that_came_along_are_reported(apart: ClickGraph):
-    """The left ball is whole in all pictures; the floor and both balls fill a close picture."""
+    """The left ball is fully visible, so there is no warning. The whole scene fills a close view, so there is one."""
     close = Camera.look_at(
         np.array([0.0, -1.5, 2.5]), np.zeros(3), UP, width=400, height=300, vertical_fov_degrees=50.0
     )

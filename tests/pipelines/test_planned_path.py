@@ -43,7 +43,7 @@ def test_a_jump_s_plan_crouches_rises_as_requested_and_ends_at_touch_down() -> N
     assert known.sum() == pytest.approx(whole / DT, abs=2)
     assert path[known, 2].min() == pytest.approx(-plan.crouch_depth, rel=0.1)
     assert path[known, 2].max() == pytest.approx(jump.target.height, rel=0.15)
-    # The path does not jump: a step is at most as long as the displacement at the speed of the flight.
+    # The path is continuous: a step is not much longer than the displacement at the speed of the flight.
     steps = np.linalg.norm(np.diff(path[known], axis=0), axis=1)
     assert steps.max() < 1.3 * DT * np.hypot(plan.speed_up, plan.speed_forward)
     assert path[known][-1] @ jump.ground.axes[0] > 0.5 * jump.target.distance

@@ -47,7 +47,7 @@ def test_the_same_run_gives_the_same_bytes_and_another_another_picture(tmp_path:
 
 
 def test_ahead_is_the_front_of_the_body(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A flight along x of a body that faces y goes to its right."""
+    """If a body faces y and flies along x, the plot shows a displacement to its right."""
     drawn = {}
     plot = Axes.plot
 

@@ -1,4 +1,4 @@
-"""Camera poses of photos by pycolmap."""
+"""Estimation of camera poses of photos by pycolmap."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
 def test_a_folder_belongs_to_one_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Remnants of a killed run are removed; an earlier run is refused or moved aside; unfinished files have temporary
-    names."""
+    """Remnants of a killed run are removed, an earlier run is refused or moved aside, and the files of a failed run are
+    removed."""
     photos, out = photos_of_noise(tmp_path / "photos"), tmp_path / "out"
     left = out / ".egs-pose-left"
     left.mkdir(parents=True)
@@ -91,7 +91,7 @@ def test_a_folder_belongs_to_one_run(
 def test_a_truncated_model_is_reported(
     room: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """COLMAP does not report an incomplete write of its model on a full disk."""
+    """COLMAP does not report that it wrote its model incompletely on a full disk; the command does."""
     reconstruct_by(monkeypatch, partial(model, capacity=room))
     out = tmp_path / "out"
     assert main(["pose", str(photos_of_noise(tmp_path / "photos")), "--out", str(out)]) == 1
@@ -102,7 +102,7 @@ def test_a_truncated_model_is_reported(
 def test_failures_of_colmap_are_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The example is a database on a full disk."""
+    """COLMAP's error for a database that cannot be opened is reported in one line."""
 
     def fails(*_: object, **__: object) -> None:
         raise RuntimeError("No registered database factory succeeded.\nmore")
@@ -122,8 +122,8 @@ def test_failures_of_colmap_are_one_line(
 def test_photos_of_a_room_get_their_known_poses(
     data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Twelve adjacent photos of the bonsai, one of them rotated by an EXIF tag: all get poses, with the known relative
-    distances."""
+    """All twelve adjacent photos of the bonsai, one of which is rotated by an EXIF tag, get poses. The relative
+    distances of the cameras are the known ones."""
     pytest.importorskip("pycolmap")
     photos = tmp_path / "photos"
     photos.mkdir()

@@ -1,4 +1,5 @@
-"""``animate SCENE --object``: invalid arguments are reported first, no file is lost, and a video is written."""
+"""``animate SCENE --object``: invalid arguments are reported before the scene is prepared, no file is lost, and a film
+is written."""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ from tests.support.scenes import FLOOR, ball_on_floor
 
 @pytest.fixture(scope="module")
 def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A ball on a floor."""
+    """Write a ball on a floor."""
     path = tmp_path_factory.mktemp("scene") / "scene.ply"
     write_ply(path, ball_on_floor()[0])
     return path
@@ -33,7 +34,7 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def prepared() -> PreparedScene:
-    """The ball separated from its floor, whose hole is left open."""
+    """Separate the ball from its floor, whose hole stays open."""
     options = SceneOptions(clearing=StraddlingPolicy.SPLIT, inpaint=False)
     return prepare_scene(ball_on_floor()[0], ObjectSpec(point=np.array([0.0, -0.5, 0.5])), options=options)
 
@@ -124,8 +125,8 @@ def test_the_parts_of_earlier_steps_are_animated(
 
 @pytest.mark.slow
 def test_uneven_ground_is_passed_on_with_the_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The ground is measured, reported, written beside the plane, read again and passed to the animation; ``--flat``
-    keeps the plane; the object settles on it where it stood.
+    """The ground is measured, reported, written next to the plane, read again and passed to the animation; with
+    ``--flat`` the plane is used instead. The object comes to rest on the ground where it stood.
     """
     cloud, truth = on_folds(0.04, length=0.9)
     click = ObjectSpec(point=np.array([0.0, 0.0, 0.5]))
@@ -152,9 +153,9 @@ def test_uneven_ground_is_passed_on_with_the_parts(tmp_path: Path, monkeypatch: 
     creature = make_creature(prepared.object, options=CreatureOptions(ground=ground, sag=0.01, nodes=120))
     body, start = creature.body, creature.start.positions
     assert creature.geometry.field is not None
-    # It touches the ground where it was captured, and sinks by 0.015. If the ground were not raised to it, it would
-    # hang 0.017 above and sink by 0.027. A ball on the slope of a fold rolls: on the folds themselves its centre moves
-    # by 0.075 to the side.
+    # The body touches the ground where it was captured, and sinks by 0.015. If the ground were not raised to it, it
+    # would hang 0.017 above the ground and sink by 0.027. On the slope of a fold, the ball would roll: its centre would
+    # move by 0.075 to the side.
     assert abs(creature.stepper.detector.gaps(body.mesh.nodes)[0].min()) < 0.005 * body.height
     assert abs((body.centre_of_mass(start) - body.centre_of_mass(body.mesh.nodes))[2]) < 0.02 * body.height
     assert creature.stepper.detector.gaps(start)[0].min() > -0.01 * body.height
@@ -164,7 +165,8 @@ def test_uneven_ground_is_passed_on_with_the_parts(tmp_path: Path, monkeypatch: 
 def test_one_command_from_a_scene_to_a_video(
     scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The test runs as if PyTorch were missing, because training takes a minute."""
+    """The film, the parts and the filled floor are written. PyTorch is treated as missing, because training would take
+    a minute."""
     monkeypatch.setattr("egs_warp.pipelines.prepare_scene.has_torch", lambda: False)
     scene, out = str(scene_file), tmp_path / "out"
     flags = ["--object", "0,-0.5,0.5", "--frames", "2", "--size", "64", "--out", str(out)]
@@ -225,8 +227,8 @@ def test_a_scene_is_prepared_and_viewed_from_its_cameras() -> None:
 
 @pytest.mark.slow
 def test_a_hovering_object_leaves_no_hole(tmp_path: Path) -> None:
-    """A ball at a fifth of its size above the floor is set down; no floor is painted, and ``plane.json`` has no
-    hole."""
+    """A ball that hovers over the floor by a fifth of its size is set down; no floor is inpainted, and ``plane.json``
+    has no hole."""
     cloud, truth = ball_on_floor(lift=0.33)
     spec = ObjectSpec(point=np.array([0.0, -0.5, 0.83]))
     scene = prepare_scene(cloud, spec, options=SceneOptions(clearing=StraddlingPolicy.SPLIT))

@@ -1,4 +1,4 @@
-"""Progress bars with a realistic remaining time."""
+"""Progress bars: stages, remaining time, and redraws while a stage reports nothing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from egs_warp.segmentation.clearance import StraddlingPolicy
 
 
 class Terminal(io.StringIO):
-    """Text that claims to be shown by a terminal."""
+    """Text stream that reports to be a terminal."""
 
     def isatty(self) -> bool:
         return True
@@ -43,7 +43,8 @@ def drawn(options: SceneOptions, monkeypatch: pytest.MonkeyPatch, told: list[tup
 
 
 def test_a_scene_shows_its_stages_and_the_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the middle of the longest stage, half of the time has passed, to a few percent; its own pace counts."""
+    """The remaining time follows from the typical fractions of the stages and the completed fraction of the current
+    one; in the middle of the longest stage, it is close to the elapsed time."""
     told = [(0.0, "plane", 0.0), (12.0, "ground", 0.0), (27.0, "segment", 0.0), (50.0, "segment", 0.5)]
     assert drawn(SceneOptions(clearing=StraddlingPolicy.FINETUNE), monkeypatch, told) == [
         "scene: plane, 00:00<?",
@@ -54,7 +55,7 @@ def test_a_scene_shows_its_stages_and_the_remaining_time(monkeypatch: pytest.Mon
 
 
 def test_skipped_stages_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without ground, training and floor, little remains after the plane."""
+    """If ground, training and inpainting are skipped, little time remains after the plane."""
     options = SceneOptions(clearing=StraddlingPolicy.SPLIT, flat=True, inpaint=False)
     lines = drawn(options, monkeypatch, [(0.0, "plane", 0.0), (12.0, "segment", 0.0)])
     assert lines[1] == "scene: segment, 00:12<00:02"
@@ -81,7 +82,7 @@ def test_stages_show_the_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_the_times_move_while_a_stage_reports_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stage that takes five times its share still has a remaining time, which the bar draws by itself."""
+    """The bar redraws itself. A stage that takes five times its expected time still has a remaining time."""
     clock = [1000.0]
     monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
     monkeypatch.setattr("egs_warp.pipelines.progress._REFRESH_INTERVAL", 0.01)
@@ -149,7 +150,7 @@ def test_all_stages_from_photos_to_a_film_share_one_line(
         with render_bar(2) as show_image:
             show_image()
             shown()
-    # The training took 100 s, so that the scene, of 3/10 of its share, takes 30 s; the rest takes 28 s.
+    # The training took 100 s. The scene, with 3/10 of the expected time of the training, takes 30 s, and the rest 28 s.
     assert [line.split(",")[0] for line in lines] == [f"photos to film: {s}" for s in ("scene", "simulate", "render")]
     assert lines[0].endswith(", 01:40<00:58")
     assert file.getvalue().split("\r")[-1].startswith("photos to film: done, 01:40")

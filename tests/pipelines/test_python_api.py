@@ -1,4 +1,5 @@
-"""The Python API takes what its functions give: captures, axes by name, scripts and motions of the user's own."""
+"""The Python API: arguments of ``make_creature`` and ``simulate``, such as captures, axes by name, scripts and motions
+that the user defines."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ from tests.support.ply_variants import columns_of, ply_of
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> egs.Capture:
-    """A small pawn with z up, from a file that does not state it."""
+    """Read a small pawn with z up from a file that does not define the up direction."""
     path = tmp_path_factory.mktemp("capture") / "pawn.ply"
     egs.write_ply(path, pawn(gaussian_count=1500, device="cpu").cloud)
     return egs.read_capture(path)
@@ -34,7 +35,7 @@ def creature(capture: egs.Capture) -> egs.Creature:
 
 
 def test_a_creature_is_made_of_a_capture_alone(creature: egs.Creature) -> None:
-    """Up is estimated, as the command does, and said."""
+    """The up direction is estimated as by the command, and a note reports it."""
     (note,) = creature.notes
     assert note.startswith("up is estimated as +z (guessed: ") and note.endswith("; if that is wrong, give up")
     np.testing.assert_allclose(creature.frame.axes[2], [0.0, 0.0, 1.0])
@@ -98,7 +99,7 @@ class Record:
 
 
 class Still:
-    """Motion of the user's own: no objective, at rest after its time."""
+    """User-defined motion without objectives, which is at rest after ``expected_time``."""
 
     expected_time = 0.05
 
@@ -153,7 +154,7 @@ def test_records_are_short_in_print(creature: egs.Creature, capture: egs.Capture
 
 
 def test_warp_starts_silently_unless_it_is_asked_to_speak(capture: egs.Capture) -> None:
-    """Its greeting of seven lines, and its warning about a missing driver."""
+    """Warp's banner of seven lines and its warning about a missing driver appear only if the user sets a log level."""
     script = "import warp as wp; {}import egs_warp as egs; egs.read_capture({!r})"
     for asked, is_silent in (("", True), ("wp.config.log_level = wp.LOG_DEBUG; ", False)):
         command = [sys.executable, "-c", script.format(asked, str(capture.source))]

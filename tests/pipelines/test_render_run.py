@@ -1,4 +1,4 @@
-"""Videos of a finished run: the same one again, and others."""
+"""Videos of a finished run: identical to its film without flags, and with other cameras, sizes, formats and lights."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_without_flags_it_is_the_film_bit_for_bit(run_folder: Path, tmp_path: Pa
 def test_files_of_a_run_are_not_overwritten(
     line: str, run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its video and its steps stay, and so do their checksums."""
+    """No command overwrites the film or the trajectory of a run, or a part of a segmented scene."""
     write_ply(tmp_path / "a.ply", pawn(gaussian_count=50).cloud)
     with owned(tmp_path / "other", command="segment") as other:
         write_ply(other.file("object.ply"), pawn(gaussian_count=60).cloud)
@@ -87,7 +87,7 @@ def test_every_camera_shows_the_whole_creature(camera: str, run: FinishedRun) ->
     moved = any(not np.allclose(one.centre, cameras[0].centre) for one in cameras)
     assert moved == (camera != "fixed")
     if camera == "follow":
-        # Along the ground: a jump does not look like a sinking floor.
+        # The camera moves horizontally; otherwise the floor would seem to sink in a jump.
         np.testing.assert_allclose([one.centre[2] for one in cameras], cameras[0].centre[2])
 
 
@@ -175,7 +175,7 @@ def test_depth_is_in_millimetres_and_alpha_is_the_creatures(run: FinishedRun, tm
 
 @pytest.mark.parametrize("ending", [".mov", ".webm"])
 def test_videos_keep_alpha(ending: str, run: FinishedRun, tmp_path: Path) -> None:
-    """Videos are decoded by ffmpeg; VP9 with alpha by its own library."""
+    """Alpha and colours survive encoding and decoding by ffmpeg; VP9 with alpha is decoded by libvpx."""
     import subprocess
 
     from egs_warp.io.video import ffmpeg_program
@@ -204,8 +204,8 @@ def test_videos_keep_alpha(ending: str, run: FinishedRun, tmp_path: Path) -> Non
 
 
 def test_a_main_light_changes_the_shadow_and_no_pixel_of_a_creature_at_rest(run: FinishedRun, tmp_path: Path) -> None:
-    """The light is read back from the run's file. The creature's colours have the same bits until it turns, and
-    without the light the picture is that of a run that has none."""
+    """The light is read from the run's file and changes the shadow. The creature's colours are bitwise the same until
+    it rotates. With the light switched off, the image equals that of a run without a light."""
     direction = np.array([0.48, 0.64, 0.6])
     form = irradiance_form(0.4, 0.1, np.array([0.0, 0.0, 1.0]), 0.8, direction)
     creature = replace(run.creature, light=MainLight(direction, 5.0, 0.4, form))

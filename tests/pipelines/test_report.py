@@ -1,4 +1,4 @@
-"""Sums in the report."""
+"""The report of a run: stage times, versions of packages, and the lines of the summary."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from egs_warp.pipelines.report import MotionReport, Report, StageTime, stage_tim
 
 
 def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
-    """Three frames consist of two, one and one steps, of which only the last replans."""
+    """Three frames have two, one and one steps, of which only the last one replans. The times of a frame are sums over
+    its steps."""
     spent = [{"predict": 3.0}, {"predict": 5.0}, {"predict": 1.0}, {"predict": 6.0, "replan": 9.0}]
     steps = [cast(StepReport, SimpleNamespace(milliseconds=stages)) for stages in spent]
     timing = stage_times(steps, np.array([0, 2, 3, 4]), {"render": [2.0, 4.0], "split": []})
@@ -38,7 +39,8 @@ def motion_report(name: str, asked: dict[str, float], state: State = State.DONE,
 
 
 def test_the_result_is_one_line_without_exponents() -> None:
-    """Each motion has its measured and requested values; equal motions in a row are one; a bad end comes first."""
+    """The result lists measured and requested values of each motion, and combines equal consecutive motions. A failure
+    comes first."""
     jump = motion_report("jump", {"distance": 0.5, "height": 0.2}, distance=0.4921, height=1.98e-1)
     hops = [
         motion_report("hop", {"distance": 0.7, "height": 0.3, "square": k}, distance=0.7 + 0.01 * k) for k in (1, 2)

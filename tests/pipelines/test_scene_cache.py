@@ -1,4 +1,4 @@
-"""Cache of prepared scenes: found by content, limited, and never in the way."""
+"""Cache of prepared scenes: keyed by content, limited in size, and ignored if it is damaged or cannot be written."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_second_motion_reads_the_scene(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The scene of the cache equals the prepared one to the bit; another object is prepared."""
+    """The cached scene is bitwise equal to the prepared one; for another object, the scene is prepared again."""
     calls: list[ObjectSpec] = []
 
     def prepared(_: GaussianCloud, spec: ObjectSpec, **__: object) -> PreparedScene:

@@ -1,4 +1,4 @@
-"""Warnings about the segmentation of an object, and none for a good one."""
+"""Warnings about the segmentation of an object; a complete object causes none."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CAMERAS = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 1.0, count=4, elevation
 
 @pytest.fixture(scope="module")
 def located_ball() -> tuple[GaussianCloud, LocatedPlane]:
-    """A ball on a floor, located by a point."""
+    """Locate a ball on a floor by a point; return the scene and the located plane."""
     cloud = concatenate(round_ones(shell(), 0.03), lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
     return cloud, locate_plane(cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5])), plane=FLOOR)
 
@@ -45,7 +45,8 @@ def test_an_object_at_the_edge_of_pictures(located_ball: tuple[GaussianCloud, Lo
 
 
 def test_surroundings_that_came_along(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
-    """A wall and a ceiling about the ball are visible at three edges of one picture and at no edge of the others."""
+    """Around the ball, a wall and a ceiling were segmented, too. They touch three edges of one view and no edge of the
+    others."""
     cloud, located = located_ball
     near = [replace(CAMERAS[0], fx=4.0 * CAMERAS[0].fx, fy=4.0 * CAMERAS[0].fy), *CAMERAS[1:]]
     assert segmentation_warnings(cloud, located, cloud.subset(located.segmentation.object_mask), near) == [
@@ -75,7 +76,7 @@ def test_an_object_that_is_most_of_the_capture(located_ball: tuple[GaussianCloud
 
 
 def test_an_object_without_its_foot(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
-    """The lowest part of a ball of one unit is missing up to 0.17: a tenth of its size, the diagonal of its box."""
+    """The lowest 0.17 of a ball of diameter 1 is missing, a tenth of its size, which is the diagonal of its box."""
     cloud, located = located_ball
     kept = located.segmentation.object_mask & (cloud.means.numpy()[:, 2] > 0.17)
     (line,) = segmentation_warnings(cloud, changed(located, kept), cloud.subset(kept), CAMERAS)
@@ -83,7 +84,7 @@ def test_an_object_without_its_foot(located_ball: tuple[GaussianCloud, LocatedPl
 
 
 def test_a_floor_that_came_along(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
-    """The part of the floor on one side was segmented with the object: half of the floor within the object's size."""
+    """The floor on one side was segmented with the object: half of the floor within the object's size."""
     cloud, located = located_ball
     means = cloud.means.numpy()
     kept = located.segmentation.object_mask | ((np.arange(cloud.count) >= 1500) & (means[:, 0] > 0.0))

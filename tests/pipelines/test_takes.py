@@ -20,11 +20,11 @@ from egs_warp.pipelines.takes import simulate_takes
 from tests.support.creatures import coarse_pawn
 
 FRAMES = 16
-"""Frames after which the stub of ``falls_above`` has reported a fall."""
+"""Number of frames within which the stub of ``falls_above`` reports a fall."""
 
 
 def falls_above(monkeypatch: pytest.MonkeyPatch, height: float) -> None:
-    """Let a jump fall at once if it is higher than ``height`` body heights."""
+    """Replace the detection of falls: a jump higher than ``height`` body heights is reported as a fall."""
 
     def lying_note(monitor: FallMonitor, *_: Any) -> str | None:
         jump = monitor.sequence.done[-1].motion
@@ -63,7 +63,7 @@ def test_the_first_take_without_a_fall_is_shown(monkeypatch: pytest.MonkeyPatch,
 
 @pytest.mark.parametrize("get_up", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_if_all_takes_fall_the_first_one_goes_on(get_up: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The steps up to its fall are not solved again."""
+    """If all takes fall, the result is the first take, which continues after its fall."""
     falls_above(monkeypatch, 0.0)
     run, takes = simulate_takes(
         *(coarse_pawn(), motion("jump 0.5 0.2")), frames=FRAMES, get_up=get_up, parts=lambda: tmp_path / "parts"
@@ -75,7 +75,7 @@ def test_if_all_takes_fall_the_first_one_goes_on(get_up: bool, monkeypatch: pyte
 
 @pytest.mark.parametrize("arguments", [{"retakes": False}, {"pushes": (Push(0.0, np.array([0.01, 0.0, 0.0])),)}])
 def test_a_fall_is_shown_if_it_is_wanted(arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A push may be meant to throw the body over."""
+    """A fall is not retaken if retakes are disabled, or if the body is pushed, which may be meant to make it fall."""
     falls_above(monkeypatch, 0.0)
     run, takes = simulate_takes(coarse_pawn(), motion("jump"), frames=FRAMES, get_up=False, **arguments)
     assert takes == () and run.fallen is not None

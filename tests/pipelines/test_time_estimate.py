@@ -1,4 +1,4 @@
-"""The remaining time in a progress bar is right within a factor of two."""
+"""Estimate of the number of frames of a simulation, for the progress bar: within a factor of two."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NEAR = 20
 
 
 def _estimates(text: str, frames: int | None = None) -> np.ndarray:
-    """Return the number of done and expected frames (n, 2) after each frame."""
+    """Return the numbers of finished and of expected frames (n, 2) after each frame of a simulation."""
     estimates: list[tuple[int, int]] = []
     simulate(
         coarse_pawn(), motion(text), frames=frames, progress=lambda done, expected: estimates.append((done, expected))
@@ -27,7 +27,8 @@ def _estimates(text: str, frames: int | None = None) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("text", ["jump", "hop x2 0.4 0.2", "twist 60", "twist 180", "walk 0.2", "jump 0 0.1, turn 30"])
 def test_the_estimate_is_within_a_factor_of_two(text: str) -> None:
-    """The last ``NEAR`` frames are excluded. Only in the air is it known whether a twist needs another jump."""
+    """The estimate of the remaining frames is within a factor of two, except for the last ``NEAR`` frames. A twist
+    decides only in the air whether it needs another jump."""
     done, expected = _estimates(text).T
     count = len(done)
     far = done < count - NEAR
@@ -40,5 +41,5 @@ def test_the_estimate_is_within_a_factor_of_two(text: str) -> None:
 
 
 def test_requested_frames_are_the_estimate() -> None:
-    """The first frame is the body at rest."""
+    """With 4 requested frames, 3 are expected to be simulated, because the first one shows the body at rest."""
     np.testing.assert_array_equal(_estimates("jump", frames=4)[:, 1], 3)

@@ -85,7 +85,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 
 
 def test_unusable_photos_are_named_and_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One photo is missing, one truncated, one has another shape; the others are trained."""
+    """One photo is missing, one is truncated, and one has another shape; the other photos are used."""
     posed = posed_folder(tmp_path / "posed")
     (posed / "r_5.png").unlink()
     (posed / "r_3.png").write_bytes((posed / "r_3.png").read_bytes()[:60])
@@ -114,8 +114,8 @@ def test_without_any_photo_an_earlier_result_stays(tmp_path: Path, capsys: pytes
 
 
 def test_portrait_and_landscape_through_a_lens(tmp_path: Path) -> None:
-    """Two cameras, both with lens distortion, one with images rotated by an EXIF tag: training, scores, and one contact
-    sheet."""
+    """Photos of two cameras with lens distortion, one of which stores images rotated by an EXIF tag, are trained,
+    scored and shown in one contact sheet."""
     posed = posed_folder(tmp_path / "posed", size=48)
     tree = json.loads((posed / "transforms.json").read_text())
     for number, frame in enumerate(tree["frames"]):
@@ -139,7 +139,7 @@ def test_portrait_and_landscape_through_a_lens(tmp_path: Path) -> None:
 
 
 def test_a_photo_with_a_wrong_pose_is_detected_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One of sixteen photos was taken from another pose than its own."""
+    """One of sixteen photos has a wrong pose; it is excluded and reported."""
     posed = posed_folder(tmp_path / "posed", count=16)
     tree = json.loads((posed / "transforms.json").read_text())
     wrong = tree["frames"][5]
@@ -153,8 +153,8 @@ def test_a_photo_with_a_wrong_pose_is_detected_and_named(tmp_path: Path, capsys:
 
 
 def test_reduced_photos_keep_their_colours_and_field_of_view(tmp_path: Path) -> None:
-    """A photo of half the size has the same mean, and its camera the same field of view; transparent pixels do not
-    bleed."""
+    """A photo of half the size has the same mean colour, and its camera has the same field of view. Transparent pixels
+    do not change the colours of their neighbours."""
     posed = posed_folder(tmp_path / "posed", alpha=True)
     full, half = read_views(posed).views[3], read_views(posed, max_side=16).views[3]
     assert full.alpha is not None and half.alpha is not None
@@ -165,7 +165,7 @@ def test_reduced_photos_keep_their_colours_and_field_of_view(tmp_path: Path) -> 
 
 
 def test_masks_beside_the_photos_remove_the_background(tmp_path: Path) -> None:
-    """COLMAP's ``masks/PHOTO.png``: pixels outside the mask are background, whatever the photo shows there."""
+    """With masks named as by COLMAP, ``masks/PHOTO.png``, pixels outside the mask are replaced by the background."""
     posed = posed_folder(tmp_path / "set" / "images")
     masks = tmp_path / "set" / "masks"
     masks.mkdir()
@@ -197,7 +197,8 @@ def test_the_centre_is_where_the_cameras_point() -> None:
 
 
 def test_the_first_cloud_fills_the_silhouettes_and_nothing_else() -> None:
-    """Masks of a small sphere: all points are inside nine of ten masks, and are spread over the whole sphere."""
+    """For masks of a small sphere, the points of the initial cloud are distributed over the whole sphere, and in each
+    view at least 85 % of them are inside the mask."""
     centre, radius = np.array([0.1, -0.05, 0.0]), 0.2
     views = []
     for camera in ring(12, 64):
@@ -238,7 +239,7 @@ def test_cameras_without_a_common_view_are_refused() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "least"), [("bonsai", 17.0), ("mouse", 22.0)])
 def test_photos_of_a_room_become_a_capture(name: str, least: float, data_dir: Path) -> None:
-    """A room with slight lens distortion, and a desk in portrait and landscape; both at reduced size."""
+    """The photos show a room with slight lens distortion, or a desk in portrait and landscape, at reduced size."""
     result = train(data_dir / "posed" / name, iterations=300, max_gaussians=5000, max_side=90, device="cpu")
     held_out = result.mean_score(held_out=True)
     assert held_out is not None and held_out.psnr > least

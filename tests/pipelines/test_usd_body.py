@@ -1,4 +1,4 @@
-"""The soft body in a USD stage, as a simulator of physics reads it."""
+"""The soft body in a USD stage: mesh, mass, material and ground for other physics simulators."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tasks on processes, and on Ray if it is installed: lost tasks are run again, finished ones are not."""
+"""Tasks in worker processes, and on Ray if it is installed: lost tasks are repeated, finished ones are not."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ AT_LAST = "its worker was lost 3 times, finally: it ended by signal 9"
 
 @pytest.fixture(scope="module")
 def ray_here() -> Any:
-    """A local Ray instance without a dashboard, shared by all tests of this file."""
+    """Start a local Ray instance without a dashboard for all tests of this file."""
     ray = pytest.importorskip("ray")
     ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
     yield ray
@@ -36,7 +36,7 @@ def ray_here() -> Any:
 
 @pytest.fixture(params=[2, pytest.param("ray", marks=NO_RAY)], ids=str)
 def workers(request: pytest.FixtureRequest) -> int | str:
-    """Two processes, of each kind in turn."""
+    """Return the argument for two workers of each kind in turn: processes, and Ray."""
     if request.param == "ray":
         request.getfixturevalue("ray_here")
     return request.param
@@ -64,7 +64,7 @@ def test_each_task_ends_once_and_an_error_is_its_own(workers: int | str) -> None
 
 
 def test_lost_tasks_are_run_again_and_finished_ones_are_not(workers: int | str, tmp_path: Path) -> None:
-    """Task 1 kills its worker once, task 3 twice, task 4 in each attempt: no other task is repeated or lost."""
+    """Task 1 kills its worker once, task 3 twice, and task 4 in each attempt; no other task is repeated or lost."""
     work = tasks.Dying(tmp_path, {1: 1, 3: 2, 4: 99})
     ended = in_order(list(map_tasks(work, range(7), workers=workers)))
     assert [one.attempts for one in ended] == [1, 2, 1, 3, 3, 1, 1]
@@ -107,8 +107,8 @@ def test_a_missing_ray_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 def started(body: str, *arguments: str) -> subprocess.Popen[str]:
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r})\n" + textwrap.dedent(body)
     command = [sys.executable, "-c", code, *arguments]
-    # A process group of its own, so that the test's Ctrl-C reaches only this program, as a terminal's reaches a whole
-    # group.
+    # The program gets its own process group, so that the test can send Ctrl-C to the whole group, as a terminal does,
+    # without ending itself.
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
@@ -121,7 +121,7 @@ def until(true: Callable[[], bool], seconds: float = 60.0) -> None:
 
 def lives(process: int) -> bool:
     try:
-        # A zombie has ended; only its parent has not read its status yet.
+        # A zombie has ended, but its parent has not read its status yet.
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
@@ -174,7 +174,7 @@ def test_functions_of_a_script_are_found_in_workers(tmp_path: Path) -> None:
             """
         )
     )
-    # With unbuffered output, which some machines set, nothing could be lost.
+    # Some machines set unbuffered output, with which no output could be lost.
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": ""}
     run = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environment, timeout=120)
     assert run.stdout == "[1, 8, 27]\n" and run.stderr.count("heard") == 3, run.stderr

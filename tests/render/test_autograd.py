@@ -19,8 +19,8 @@ NAMES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
 
 def clear_scene(seed: int = 1) -> tuple[dict[str, np.ndarray], Camera]:
-    """Return soft splats wider than the image, at separate depths and with colours off zero, so that no discontinuity
-    is near."""
+    """Return soft splats that are wider than the image, at separate depths and with positive colours, so that no
+    discontinuity of the renderer is near."""
     random = np.random.default_rng(seed)
     count = 7
     values = {
@@ -116,7 +116,7 @@ def many_splats(count: int = 800) -> tuple[dict[str, np.ndarray], Camera]:
 
 def test_directional_derivative_of_a_crowded_scene(device: str) -> None:
     """A step along the gradient changes the loss of the float64 reference as predicted, for hundreds of overlapping
-    splats with early stops."""
+    splats and pixels that are opaque before the last splat."""
     values, camera = many_splats(300)
     got = gradients(values, camera, device)
     random = np.random.default_rng(3)
@@ -152,8 +152,8 @@ def test_cuda_gradients_match_the_cpu_and_repeat() -> None:
 
 @pytest.mark.cuda
 def test_work_is_queued_on_torchs_stream() -> None:
-    """The image is queued on torch's stream: its inputs are still being written on a side stream at the time of the
-    call."""
+    """The image is rendered on torch's current stream, so inputs that are still being written on that stream at the
+    time of the call are complete."""
     values, camera = many_splats()
     tensors = [torch.tensor(values[name], dtype=torch.float32, device="cuda") for name in NAMES]
     expected = render_torch(*tensors, camera=camera).colour
@@ -183,8 +183,7 @@ def test_a_picture_without_gradients_has_the_same_bits(device: str) -> None:
 
 
 def test_images_keep_the_memory_of_their_gradients(device: str) -> None:
-    """Two images are rendered before either backward pass: memory that the gradients need must not be reused
-    meanwhile."""
+    """Two images are rendered before the backward pass of either; memory that their gradients need is not reused."""
     values, camera = many_splats()
     nearer = replace(camera, translation=camera.translation - [0.0, 0.0, 0.8])
 
@@ -204,7 +203,7 @@ def test_images_keep_the_memory_of_their_gradients(device: str) -> None:
 
 
 def test_masked_tiles_show_the_background_and_have_no_gradient(device: str) -> None:
-    """Gradients are those of a loss without the masked tiles; gsplat's masks have the same tiles."""
+    """Gradients equal those of a loss without the masked tiles. The tiles are those of gsplat's masks."""
     values, camera = many_splats()
     mask = np.random.default_rng(5).random((5, 6)) < 0.5
     pixels = torch.tensor(np.kron(mask, np.ones((16, 16), bool))[:70, :90], device=device)
@@ -245,7 +244,8 @@ def test_pixels_share_memory_and_bad_tensors_are_named() -> None:
 
 
 def test_screen_positions_get_a_gradient_on_request(device: str) -> None:
-    """Moving every splat by one pixel moves the principal point: the sums equal the camera's gradient."""
+    """A shift of all splats on the screen equals a shift of the principal point, so the sum of the gradients equals the
+    camera's gradient."""
     values, camera = clear_scene()
     tensors = [torch.tensor(values[name], dtype=torch.float32, device=device, requires_grad=True) for name in NAMES]
     screen = torch.zeros((len(values["means"]), 2), device=device, requires_grad=True)
@@ -268,8 +268,8 @@ def test_screen_positions_get_a_gradient_on_request(device: str) -> None:
     "case", ["none visible", "covers all", "one pixel", "inside", "opaque", "clear", "tiny", "flat"]
 )
 def test_degenerate_scenes_have_finite_gradients(device: str, case: str) -> None:
-    """Invisible scenes give exactly zero gradients; degenerate ones give no NaN or infinity, also in the antialiased
-    mode, which divides by the area."""
+    """Scenes without a visible splat give exactly zero gradients. Degenerate scenes give finite ones, also in the
+    antialiased mode, which divides by the area."""
     values, camera = clear_scene()
     values = {name: value.copy() for name, value in values.items()}
     if case == "none visible":

@@ -1,4 +1,4 @@
-"""Shadow of the animated object: soft, and only where the floor is visible."""
+"""Contact shadow of the animated object, and the studio floor."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def square(values: Any) -> np.ndarray:
 
 
 def test_the_shadow_falls_on_the_visible_floor() -> None:
-    """The image is darker under the body and unchanged elsewhere and on what hides the floor; higher bodies cast
-    softer, paler shadows."""
+    """The image is darker under the body, and unchanged elsewhere and on surfaces in front of the floor. A higher body
+    has a paler shadow."""
     body, floor = parts()
     bare, dark = (over_scene(floor, body, shadow=shadow) for shadow in (False, True))
     ground = on_ground(body)
@@ -83,8 +83,8 @@ def test_the_shadow_falls_on_the_visible_floor() -> None:
 
 
 def test_the_shadow_on_an_uneven_floor_has_no_edge() -> None:
-    """The half of a floor that is 3 % of the reach above the fitted plane, as cloths are, receives nearly the same
-    shadow. At a terrace too high for it the shadow ends, but not within one pixel."""
+    """If half of the floor is slightly above the fitted plane, by 3 % of the shadow's reach, as in cloth, it receives
+    nearly the same shadow. A terrace that is too high receives little, but the shadow does not end within one pixel."""
     body, flat = parts()
     darkness = []
     for step in (0.0, 0.06, 0.4):
@@ -105,7 +105,8 @@ def blurred(values: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def darkness(body: GaussianCloud, plane: Plane, centre: np.ndarray, reach: float, height: float) -> np.ndarray:
-    """Compute the shadow by an independent reference: histogram, OpenCV's blur, and each pixel's ray."""
+    """Return the shadow by an independent reference: a histogram of the body, OpenCV's blur, and the ray of each
+    pixel."""
     means, scales = body.means.numpy(), np.sort(np.exp(body.log_scales.numpy()), axis=1)
     texel, tangents, passing = 2.0 * reach / 192, np.stack(plane.tangents()), np.ones((192, 192))
     hidden = body.opacities() * 2.0 * np.pi * scales[:, 1] * scales[:, 2] / texel**2
@@ -128,8 +129,8 @@ def darkness(body: GaussianCloud, plane: Plane, centre: np.ndarray, reach: float
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
 def test_the_shadow_equals_the_reference(tilt: float, device: str) -> None:
-    """The shadow equals the reference on level and tilted ground, for bodies of other heights and Gaussian sizes,
-    visible wholly and in part."""
+    """The shadow equals the reference on level and tilted ground, for bodies with different heights and sizes of
+    Gaussians, fully or partly visible."""
     plane = Plane(np.array([np.sin(tilt), 0.0, np.cos(tilt)]), 0.1)
     random, (ball, _) = np.random.default_rng(3), parts()
     body = GaussianCloud.from_numpy(
@@ -170,8 +171,8 @@ def moved_to(cloud: GaussianCloud, device: str) -> GaussianCloud:
 
 
 def test_the_floor_hides_what_lies_below_it(device: str) -> None:
-    """A ball above the floor is seen and one below it is not; a ball in the floor ends where its mean meets the floor.
-    From below, and without a floor, all are seen."""
+    """A Gaussian above the floor is visible, one below it is not, and one in the floor is cut off at the floor. From
+    below, and without a floor, all are visible."""
     body = parts()[0].subset(np.array([0]))
     ray = camera_rays(camera())[SIDE // 2, SIDE // 2]
     hit = 2.5 / -ray[2]

@@ -85,7 +85,8 @@ def test_antialiased_mode_and_background_image(device: str) -> None:
 
 
 def test_long_thin_splats_do_not_cancel(device: str) -> None:
-    """Needles of 1000 : 1 on the screen match the reference; the usual conic form in float32 would lose every digit."""
+    """Needles with an aspect ratio of 1000 on the screen equal the reference, although the usual conic form in float32
+    would lose all digits."""
     values = random_scene(60, seed=5)
     values["log_scales"] = np.tile([1.0, -7.0, -9.0], (60, 1))
     camera = camera_of(200, 160)
@@ -198,7 +199,7 @@ def test_several_cameras_and_inconsistent_ones(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.cuda
 def test_a_full_gpu_reports_an_error_and_recovers() -> None:
-    """240 million pairs need 8 GB, but 600 MB are free."""
+    """The 240 million pairs of tiles and Gaussians need 8 GB, but only 600 MB are free."""
     torch = pytest.importorskip("torch")
     values = random_scene(200_000, coefficients=1, log_scale=3.0)
     values["opacity_logits"][:] = 2.0
@@ -234,7 +235,7 @@ def test_rotating_the_object_equals_rotating_the_camera(device: str) -> None:
 
 
 def test_depth_of_a_half_opaque_plane_is_the_planes_depth(device: str) -> None:
-    """Flat, half-opaque splats in the plane z = 0, viewed at a slant, have the depth of the plane, Eq. (18)."""
+    """Eq. (18): the depth of flat, half-opaque splats in the plane z = 0, viewed obliquely, is that of the plane."""
     grid = np.stack(np.meshgrid(np.arange(-4, 4, 0.05), np.arange(-4, 4, 0.05)), -1).reshape(-1, 2)
     count = len(grid)
     values = {
@@ -315,9 +316,9 @@ def test_impossible_cameras_and_backgrounds_are_refused() -> None:
 
 @pytest.mark.parametrize("spread", [1.0, 1e-5])
 def test_sorted_lists_equal_counted_ones(spread: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sorting (GPU) and counting (CPU) give the same Gaussians in the same order for each tile, equal depths by index.
-
-    With a spread of 1e-5, hundreds of Gaussians of each tile share the leading depth bits of the sort key.
+    """Sorting (GPU) and counting (CPU) give the same Gaussians in the same order for each tile; Gaussians of equal
+    depth are ordered by index. With a spread of 1e-5, hundreds of Gaussians of each tile share the leading depth bits
+    of the key.
     """
     values = random_scene(3000, coefficients=1, seed=12)
     camera = camera_of(200, 150)

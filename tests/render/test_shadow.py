@@ -34,7 +34,7 @@ def box() -> GaussianCloud:
 
 @pytest.mark.parametrize("lift", [0.0, 0.15])
 def test_the_shadow_of_a_box_is_its_projection_along_the_light(lift: float) -> None:
-    """On the plane, and on ground over it, the shadow is the box projected along the light."""
+    """The shadow is the box projected along the light, on the plane and on ground that is ``lift`` above it."""
     light = MainLight(direction(25.0, 50.0), 1.0, 0.5, np.eye(4))
     body = box()
     shadow_map = ShadowMap(

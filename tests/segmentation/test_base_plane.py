@@ -26,7 +26,7 @@ _OBJECTS = [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0)), ("robot.sp
 
 
 def _with_strays(cloud: GaussianCloud, count: int) -> GaussianCloud:
-    """Opaque strays up to half a height below the object."""
+    """Return the cloud with opaque strays up to half of its height below the object."""
     strays = np.random.default_rng(5).uniform([-0.4, -0.4, -0.5], [0.4, 0.4, 0.0], (count, 3))
     join = np.concatenate
     return GaussianCloud.from_numpy(
@@ -80,7 +80,7 @@ def test_planes_of_real_captures(data_dir: Path, name: str, up: tuple[int, int, 
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "up"), _OBJECTS)
 def test_up_of_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
-    """The estimate is right for every real object, and its reason is given."""
+    """The estimate is correct for every real object, and a reason is given."""
     guessed, reason = guess_up(read_capture(data_dir / "objects" / name).cloud, None)
     assert np.array_equal(guessed, up)
     assert "support polygon" in reason and "score" in reason
@@ -89,7 +89,7 @@ def test_up_of_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_up_of_a_turned_pawn(axis: int, sign: float) -> None:
-    """A pawn laid along any axis is recognised by its base."""
+    """The up direction of a pawn along any axis follows from its base."""
     cloud = pawn(gaussian_count=6000).cloud
     means = np.roll(cloud.means.numpy(), axis - 2, axis=1)
     means[:, axis] *= sign
@@ -136,8 +136,8 @@ def test_a_bevel_above_the_sole_is_not_the_support() -> None:
 
 @pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
 def test_the_support_is_the_densest_level_of_columns(size: float) -> None:
-    """Columns are denser towards the floor, with as many far above. The plane is the 15 % quantile of the bottoms
-    within 1.5 % of the height of the densest level, in any unit.
+    """The bottoms of half of the columns become denser towards the floor; the other half are far above it. The plane is
+    at the 15 % quantile of the bottoms within 1.5 % of the height of the densest level, in any unit.
     """
     bottoms = np.concatenate([0.04 * np.linspace(-1.0, 1.0, 401) ** 3, np.linspace(0.05, 0.14, 401)])
     within = bottoms[np.abs(bottoms) <= 0.015]
@@ -150,7 +150,8 @@ def test_the_support_is_the_densest_level_of_columns(size: float) -> None:
 
 
 def test_the_reason_for_up_gives_the_scores() -> None:
-    """The scores of the best axis and of the next, and whether they differ clearly: a pawn has one base, a cube six."""
+    """The reason states the scores of the best and the second-best axis, and whether they differ clearly: a pawn has
+    one base, a cube has six."""
     cube = np.random.default_rng(0).uniform(-0.5, 0.5, (4000, 3))
     cube[np.arange(4000), np.arange(4000) % 3] = np.sign(cube[np.arange(4000), np.arange(4000) % 3]) * 0.5
     block = GaussianCloud.from_numpy(
@@ -181,7 +182,7 @@ def test_a_sheet_has_no_support_along_its_normal() -> None:
 
 
 def opaque(means: np.ndarray, opacities: np.ndarray | float = 0.98) -> GaussianCloud:
-    """Small isotropic Gaussians at ``means`` (n, 3)."""
+    """Return small isotropic Gaussians at ``means`` (n, 3)."""
     logits = np.broadcast_to(np.log(opacities / (1.0 - np.asarray(opacities))), len(means))
     return GaussianCloud.from_numpy(
         means, np.tile([1.0, 0, 0, 0], (len(means), 1)), np.full((len(means), 3), -5.0), logits,
@@ -190,7 +191,7 @@ def opaque(means: np.ndarray, opacities: np.ndarray | float = 0.98) -> GaussianC
 
 
 def test_the_columns_cover_the_footprint() -> None:
-    """A block of 2 x 1 has 64 by 32 columns, all with a bottom, and its centre is in the middle of them."""
+    """A block of 2 x 1 is covered by 64 x 32 columns, whose bottoms are its base; its centre is in their middle."""
     x, y, z = np.meshgrid(np.linspace(0.0, 2.0, 160), np.linspace(0.0, 1.0, 80), [0.0, 0.5], indexing="ij")
     block = opaque(np.column_stack([x.ravel(), y.ravel(), z.ravel()]) + [3.0, -2.0, 1.0])
     seen = _underside(block, np.array([0.0, 0.0, 1.0]))
@@ -203,8 +204,8 @@ def test_the_columns_cover_the_footprint() -> None:
 
 
 def test_distant_strays_do_not_widen_the_support() -> None:
-    """A mushroom whose foot has a ninth of the area of its cap, with and without distant strays at the level of the
-    sole."""
+    """A mushroom whose foot has a ninth of the area of its cap is supported by this fraction, with and without distant
+    strays at the level of its base."""
     random = np.random.default_rng(0)
 
     def disc(radius: float, height: float, count: int) -> np.ndarray:
@@ -221,7 +222,7 @@ def test_distant_strays_do_not_widen_the_support() -> None:
 
 
 def test_haze_is_no_support() -> None:
-    """An opaque block above haze of equal mass: no visible Gaussian is low."""
+    """An opaque block over haze of equal mass has no support, because no visible Gaussian is low."""
     random = np.random.default_rng(0)
     haze, block = random.uniform(0.0, 1.0, (2, 8000, 3))
     block[:, 2] = 0.8 + 0.2 * block[:, 2]
@@ -231,7 +232,7 @@ def test_haze_is_no_support() -> None:
 
 
 def test_up_of_a_huge_capture_is_estimated_from_a_subset(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An even subset of a table gives the result of all Gaussians, in any order of the file."""
+    """The estimate from an even subset of a table equals the estimate from all Gaussians, in any order of the file."""
     random = np.random.default_rng(0)
     top = random.uniform([-1.0, -1.0, 1.0], [1.0, 1.0, 1.05], (6000, 3))
     leg = random.uniform([-0.1, -0.1, 0.0], [0.1, 0.1, 1.0], (3000, 3))

@@ -53,8 +53,8 @@ def covariances(cloud: GaussianCloud) -> np.ndarray:
 
 
 def test_reach_is_that_of_the_six_tips_or_of_the_whole_ellipsoid(device: str) -> None:
-    """Eq. (20): the reach is the farthest axis tip; that of the whole ellipsoid is larger, by at most a factor of sqrt
-    3."""
+    """Eq. (20): the extent is the height of the farthest axis tip. The extent of the whole ellipsoid is larger by a
+    factor of at most sqrt(3)."""
     cloud = cloud_near(PLANE, device)
     turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
     arms = turns * np.exp(cloud.log_scales.numpy())[:, None, :]
@@ -69,7 +69,8 @@ def test_reach_is_that_of_the_six_tips_or_of_the_whole_ellipsoid(device: str) ->
 
 
 def test_half_above_has_the_moments_of_the_cut_normal_distribution(device: str) -> None:
-    """Against SciPy's truncated normal distribution along N; the distribution across N follows by regression on it."""
+    """The moments equal those of SciPy's truncated normal distribution along N, and across N those of its linear
+    regression."""
     cloud = cloud_near(PLANE, device)
     chosen = np.arange(cloud.count) % 3 != 0
     half = half_space(cloud, PLANE, chosen)
@@ -85,7 +86,8 @@ def test_half_above_has_the_moments_of_the_cut_normal_distribution(device: str) 
         expected = sigma0[k] - hazard * (hazard - t) * np.outer(along, along)
         np.testing.assert_allclose(sigma1[k], expected, atol=3e-5 * np.trace(sigma0[k]) + 1e-9)
         assert PLANE.heights(means1[k]) > 0.0
-        # Seen along the plane, its mass is the fraction above the plane, unless its peak would exceed the original one.
+        # Viewed along the plane, its mass is that of the part above the plane, unless its peak would exceed the
+        # original.
         mass = half.opacities()[k] * np.sqrt(n @ sigma1[k] @ n)
         share = min(norm.sf(t), np.sqrt(n @ sigma1[k] @ n) / spread)
         assert mass == pytest.approx(cloud.opacities()[k] * spread * share, rel=1e-3)
@@ -125,9 +127,9 @@ def test_far_below_the_plane_the_half_lies_on_it(device: str) -> None:
 
 
 def test_straddling_gaussians_are_split_in_three(device: str) -> None:
-    """The split is along the axis that reaches farthest through the plane; the three children have the mean and
-    covariance of the parent, and none is more opaque. A Gaussian clear of the plane is unchanged, and a child below it
-    is left out.
+    """A Gaussian is split along the axis that extends farthest through the plane. The three children together have the
+    mean and covariance of the parent, and none is more opaque. A Gaussian that does not reach the plane is unchanged,
+    and a child below the plane is removed.
     """
     first, second = PLANE.tangents()
     turn = Rotation.from_matrix(np.stack([second, PLANE.normal, first], axis=1)).as_quat()[[3, 0, 1, 2]]
@@ -141,7 +143,7 @@ def test_straddling_gaussians_are_split_in_three(device: str) -> None:
         np.zeros((3, 1, 3)),
         device=device,
     )
-    # Both reach through the plane by 0.3.
+    # Both extend through the plane by 0.3.
     assert _subdivided(cloud, PLANE, ExtentMeasure.ELLIPSOID, 0.31, 100) is cloud
     split = _subdivided(cloud, PLANE, ExtentMeasure.ELLIPSOID, 0.29, 100)
     np.testing.assert_allclose(PLANE.heights(split.means.numpy()), [0.5, 0.05, 0.15, 0.25, 0.05, 0.15], atol=1e-5)
@@ -156,8 +158,8 @@ def test_straddling_gaussians_are_split_in_three(device: str) -> None:
 
 
 def tall_object(count: int = 600, straddling: float = 0.05) -> GaussianCloud:
-    """An object of height 1 on the floor, of which a share of the Gaussians straddles the floor, by about as much as
-    measured in a bedroom: their extents are 0.03 to 0.3 of the height, and most are tilted."""
+    """Return an object of height 1 on the floor. The fraction ``straddling`` of its Gaussians straddles the floor, with
+    extents of 0.03 to 0.3 of the height, as measured in a capture of a bedroom; most of them are tilted."""
     random = np.random.default_rng(5)
     low = round(straddling * count)
     means = random.uniform([-0.3, -0.3, 0.2], [0.3, 0.3, 1.0], (count, 3))
@@ -174,7 +176,8 @@ def tall_object(count: int = 600, straddling: float = 0.05) -> GaussianCloud:
 
 
 def test_subdivision_starts_with_the_farthest_extents_and_is_bounded() -> None:
-    """Without a bound, five rounds multiply the straddling Gaussians more than twentyfold."""
+    """Without a limit, five rounds multiply the straddling Gaussians by more than 20; with a limit, those with the
+    largest extents are split first."""
     cloud = tall_object()
     heights, extent = plane_extents(cloud, FLOOR)
     crossing = np.flatnonzero(np.abs(heights) < extent)
@@ -194,7 +197,7 @@ def test_subdivision_starts_with_the_farthest_extents_and_is_bounded() -> None:
 
 @pytest.mark.parametrize("straddling", [0.05, 1.0])
 def test_clearing_is_finite_and_keeps_the_number_of_gaussians(straddling: float) -> None:
-    """Also where all Gaussians straddle the plane, as those of a carpet, and some are as thin as any of a capture."""
+    """This also holds if all Gaussians straddle the plane, as in a carpet, and some of them are extremely thin."""
     pytest.importorskip("torch")
     cloud = tall_object(straddling=straddling)
     scales = cloud.log_scales.numpy().copy()
@@ -223,8 +226,8 @@ def test_an_object_that_training_moves_below_the_plane_is_split(monkeypatch: pyt
 
 
 def test_views_are_cropped_to_the_foot() -> None:
-    """A crop shows the same pixels of the foot as the whole picture; a view from which the foot is out of sight is left
-    out."""
+    """A crop contains the same pixels of the foot as the whole image. Views that do not show the foot are removed if
+    others show it."""
     pytest.importorskip("torch")
     from egs_warp.segmentation.clearance import _cropped
 
@@ -243,7 +246,7 @@ def test_views_are_cropped_to_the_foot() -> None:
 
 
 def test_gaussians_outside_all_pictures() -> None:
-    """Hidden Gaussians are in the picture; those beside and behind the camera are not."""
+    """Occluded Gaussians count as inside an image; Gaussians beside and behind the camera do not."""
     eye, up = np.array([0.0, -4.0, 0.0]), np.array([0.0, 0.0, 1.0])
     camera = Camera.look_at(eye, np.zeros(3), up, width=32, height=32)
     cloud = round_ones(np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0], [9.0, 0.0, 0.0], [0.0, -9.0, 0.0]]), 0.2)
@@ -252,7 +255,8 @@ def test_gaussians_outside_all_pictures() -> None:
 
 
 def test_foot_cameras_are_low_and_centred_on_the_foot() -> None:
-    """A column of radius 0.3, away from the origin: its foot is in the centre of each image and fills most of it."""
+    """The cameras look at a column of radius 0.3 away from the origin. They are less than 30 degrees above the plane,
+    and the foot is in the centre of each image and fills most of it."""
     turns, levels = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False), np.linspace(0.0, 1.0, 40))
     angle, height = turns.ravel(), levels.ravel()
     means = np.column_stack([5.0 + 0.3 * np.cos(angle), -3.0 + 0.3 * np.sin(angle), height])
@@ -274,7 +278,8 @@ def test_foot_cameras_are_low_and_centred_on_the_foot() -> None:
 
 @pytest.mark.parametrize("above", [True, False])
 def test_a_camera_below_the_plane_ignores_what_it_sees_through_it(above: bool) -> None:
-    """From above, all pixels of a ball over the floor count; from below, only empty pixels."""
+    """For a camera above the plane, all pixels of a ball over the floor have weight; for a camera below, only empty
+    pixels have."""
     pytest.importorskip("torch")
     ball = round_ones(shell() + [0.0, 0.0, 0.2], 0.04)
     eye = np.array([2.0, 0.0, 2.0 if above else -2.0])
@@ -326,8 +331,8 @@ def test_an_object_that_clearing_leaves_empty_is_an_error_of_that_stage() -> Non
 
 
 def test_loss_is_the_sum_over_straddling_gaussians() -> None:
-    """Eq. (21): the sum of eta_seg - |d0| where it is positive, on both sides, with gradients that finite differences
-    confirm.
+    """Eq. (21): the loss is the sum of max(eta_seg - abs(d0), 0) over Gaussians on both sides of the plane; its
+    gradients equal finite differences.
     """
     torch = pytest.importorskip("torch")
     from egs_warp.segmentation.clearance import straddling_loss
@@ -358,8 +363,8 @@ def test_loss_is_the_sum_over_straddling_gaussians() -> None:
 
 
 def test_finetuning_clears_the_plane_and_keeps_the_appearance() -> None:
-    """Eq. (20), (21): a small ball on its plane; Gaussians that crossed the plane are clear of it afterwards, and the
-    image stays the same."""
+    """Eq. (20), (21): for a small ball on its plane, training reduces the loss by at least 65 % and moves straddling
+    Gaussians up; all others are unchanged, and the image stays the same."""
     pytest.importorskip("torch")
     from egs_warp.geometry.camera import Camera
     from egs_warp.render import render_gaussians

@@ -25,7 +25,8 @@ from tests.support.scenes import FLOOR, ball_on_floor, lying, round_ones, shell
 
 
 def test_a_click_hits_the_front_surface() -> None:
-    """A hollow ball in front of a wall: the nearer side is hit, at its depth."""
+    """A click on a hollow ball in front of a wall hits the near side of the ball; a click on empty pixels hits
+    nothing."""
     skin = shell(400)
     wall = np.stack(np.meshgrid(np.linspace(-2, 2, 60), [3.0], np.linspace(-1, 3, 60)), axis=-1).reshape(-1, 3)
     cloud = round_ones(np.concatenate([skin, wall]), 0.04)
@@ -51,8 +52,8 @@ def test_haze_in_front_of_the_surface_is_not_hit() -> None:
 @pytest.mark.parametrize("axis", [0, 2])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_click_is_a_disc_about_its_pixel(axis: int, sign: float) -> None:
-    """At the edge of a sheet on any side, more than half of the disc shows the sheet; three pixels outside the edge,
-    less than half.
+    """At the edge of a sheet, on any side, more than half of the disc shows the sheet, so the click hits it. Three
+    pixels outside the edge, it does not.
     """
     eye, up = np.array([0.0, -5.0, 0.0]), np.array([0.0, 0.0, 1.0])
     camera = Camera.look_at(eye, np.zeros(3), up, width=1000, height=1000)
@@ -65,7 +66,7 @@ def test_a_click_is_a_disc_about_its_pixel(axis: int, sign: float) -> None:
 
 
 def test_a_click_hits_gaussians_at_about_the_same_depth() -> None:
-    """Five discs lie in a row along the ray. The hits are the one that contributes most of the light, and those within
+    """Five Gaussians lie along the ray. The hits are the Gaussian that contributes most to the pixel, and those within
     3 % of its distance."""
     camera = front()
     steps, opacities = np.array([4.5, 4.9, 5.0, 5.1, 5.6]), np.array([0.12, 0.12, 0.6, 0.6, 0.9])
@@ -94,8 +95,8 @@ def test_a_click_that_just_misses_selects_the_nearest_part() -> None:
 
 @pytest.mark.parametrize("opacity, through", [(0.2, True), (0.9, False)])
 def test_faint_gaussians_before_the_object_are_ignored(opacity: float, through: bool) -> None:
-    """Three flat Gaussians in a row, each a third as wide as it is distant: faint ones hide nothing, opaque ones are
-    hit."""
+    """Three wide, flat Gaussians lie in front of the ball: if they are faint, the ball is hit; if they are opaque, they
+    are."""
     skin = round_ones(shell(400), 0.04)
     means = np.concatenate([skin.means.numpy(), [[0.0, y, 0.5] for y in (-1.2, -1.0, -0.8)]])
     scales = np.concatenate([skin.log_scales.numpy(), np.log([[0.8, 0.002, 0.8]] * 3)])
@@ -145,7 +146,7 @@ def test_a_negative_click_on_the_floor_removes_nothing() -> None:
 
 
 def test_negative_clicks_on_a_ball_and_on_the_floor() -> None:
-    """Each click removes what it removes alone."""
+    """Two negative clicks together remove the Gaussians that each of them removes alone."""
     cloud = balls((-1.0, 1.0))
     mine, floor = click(cloud, (-0.5, -0.5, 0.5)), click(cloud, (-0.5, -0.9, 0.0), inside=False)
     other = click(cloud, (0.5, -0.5, 0.5), inside=False)
@@ -157,7 +158,8 @@ def test_negative_clicks_on_a_ball_and_on_the_floor() -> None:
 
 
 def test_detached_parts_in_the_air_are_added_and_standing_ones_are_not() -> None:
-    """A blossom less than two cells off belongs to the ball; one as near on the floor does not."""
+    """A small part in the air less than two cells from the ball belongs to it; a part at the same distance on the floor
+    does not."""
     random = np.random.default_rng(3)
     leaf = random.uniform(-0.06, 0.06, (60, 3))
     gap = 0.045
@@ -186,8 +188,8 @@ def test_detached_parts_belong_to_a_near_object() -> None:
     ("count", "post", "goes_along"), [(200, None, True), (30, None, False), (200, 1.15, False), (200, 1.6, True)]
 )
 def test_a_detached_hand_belongs_to_the_nearest_object(count: int, post: float | None, goes_along: bool) -> None:
-    """A hand at a fifth of the ball's size belongs to it, unless it has few Gaussians, or a post is less than twice as
-    far away.
+    """A detached hand near a ball belongs to the ball, unless it has few Gaussians, or a post is nearer than twice the
+    distance of the ball.
     """
     random = np.random.default_rng(5)
     skin = random.normal(size=(count, 3))
@@ -206,7 +208,7 @@ def test_a_detached_hand_belongs_to_the_nearest_object(count: int, post: float |
 
 
 def test_the_plane_is_below_the_lowest_click() -> None:
-    """A ball on a slab on a floor: with a second click on the side of the slab, both stand on the floor."""
+    """A ball lies on a slab on a floor. With a second click, on the side of the slab, the plane is the floor."""
     across, up_to = np.meshgrid(np.linspace(-0.9, 0.9, 46), np.linspace(0.0, 0.4, 11))
     side = np.column_stack([np.full(across.size, 0.9), across.ravel(), up_to.ravel()])
     slab = [level((-0.9, -0.9), (0.9, 0.9), 0.4, 0.04), *(side * [sign, 1, 1] for sign in (-1, 1))]

@@ -1,4 +1,4 @@
-"""Background that the framing of photos tells: it is cut off what was clicked, and nothing else is."""
+"""Background that follows from the framing of the photos: few photos show it, so it is cut from the clicked object."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.fixture(scope="module")
 def against_wall() -> GaussianCloud:
-    """A ball that touches a long wall behind it, both on a floor."""
+    """Create a ball that touches a long wall behind it, both on a floor."""
     wall = level((-4.0, 0.03), (4.0, 2.0), 0.5, 0.06)[:, [0, 2, 1]]
     ball = sheet(shell(BALL), 2.0 * (shell(BALL) - [0.0, 0.0, 0.5]), 0.045, (0.8, 0.2, 0.1))
     floor = lying(level((-4.0, -2.0), (4.0, 0.5), 0.0, 0.06))
@@ -31,7 +31,7 @@ def against_wall() -> GaussianCloud:
 
 
 def photos(count: int, target: float = 0.0) -> list[Camera]:
-    """Cameras before the wall, in an arc, that look at the place ``target`` along it."""
+    """Return cameras in an arc in front of the wall that look at the position ``target`` along it."""
     middle = np.array([target, 0.0, 0.5])
     angles = np.radians(np.linspace(-140.0, -40.0, count))
     eyes = [middle + 3.0 * np.array([np.cos(angle), np.sin(angle), 0.3]) for angle in angles]
@@ -39,7 +39,8 @@ def photos(count: int, target: float = 0.0) -> list[Camera]:
 
 
 def test_a_wall_behind_the_object_is_cut_off(against_wall: GaussianCloud) -> None:
-    """The wall is connected to the ball, so that a point alone selects both. Its ends are in few pictures."""
+    """The wall is connected to the ball, so a point alone selects both. Its ends are in few photos, so it is cut
+    off."""
     alone = ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
     wall = np.zeros(against_wall.count, bool)
     wall[BALL:] = against_wall.means.numpy()[BALL:, 2] > 0.1
@@ -51,7 +52,8 @@ def test_a_wall_behind_the_object_is_cut_off(against_wall: GaussianCloud) -> Non
 
 
 def test_only_what_few_photos_show_is_hit(against_wall: GaussianCloud) -> None:
-    """The photos of the object are those that show its point; others do not count."""
+    """Only photos that show the object's point count. The negative click that is added hits Gaussians far from the
+    object."""
     spec = ObjectSpec.of_clicks([Click(np.array([0.0, -0.5, 0.5]), np.arange(5))])
     framed = with_framing(against_wall, spec, photos(9))
     assert framed.clicks[:-1] == spec.clicks and not framed.clicks[-1].inside
@@ -70,7 +72,7 @@ def test_an_object_that_stands_alone_is_unchanged(against_wall: GaussianCloud) -
 
 
 def test_framing_says_nothing(against_wall: GaussianCloud) -> None:
-    """With few photos, with masks, and where every photo shows everything."""
+    """The clicks are unchanged with few photos, with masks, and if every photo shows the whole scene."""
     spec = ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
     assert with_framing(against_wall, spec, photos(7)) is spec
     mask = MaskedView(photos(1)[0], np.ones((48, 64), bool), "photo")

@@ -19,7 +19,7 @@ def cost(graph: SplatGraph, inside: np.ndarray, leaning: np.ndarray, smoothness:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_cut_has_the_lowest_cost(seed: int) -> None:
-    """All 2^9 labels of nine Gaussians that respect the fixed ones."""
+    """The cost is compared with all 2^9 labellings of nine Gaussians that respect the fixed labels."""
     random = np.random.default_rng(seed)
     graph = SplatGraph.linking(random.normal(size=(9, 3)), random.uniform(size=(9, 3)))
     leaning = random.normal(scale=2.0, size=9)
@@ -49,7 +49,8 @@ def test_a_chain_is_cut_at_its_widest_gap_and_at_its_change_of_colour() -> None:
 
 
 def test_distances_follow_the_links() -> None:
-    """The path follows three sides of a square, not the gap; two distant squares are not connected."""
+    """The shortest path follows three sides of an open square and does not cross the gap; two distant squares are not
+    connected."""
     side = np.linspace(0.0, 1.0, 41)
     legs = [
         np.column_stack([side * 0, side]),
@@ -60,7 +61,8 @@ def test_distances_follow_the_links() -> None:
     points = np.concatenate([points, points + [50.0, 0.0, 0.0]])
     graph = SplatGraph.linking(points, np.full((len(points), 3), 0.5))
     ways = graph.distances(np.array([0]))
-    # The other end of the open square: three sides with steps of 1/40, whose median link is two or three steps long.
+    # The end of the open square is three sides away from the start, 6 times the distance of the middle of the first
+    # side.
     assert ways[82] / ways[20] == pytest.approx(6.0, rel=0.05)
     assert np.isinf(ways[123:]).all()
 

@@ -20,13 +20,13 @@ EACH = 1500
 
 
 def shares(chosen: np.ndarray) -> tuple[float, float, float]:
-    """Return the chosen shares of the left ball, the right ball and the floor."""
+    """Return the selected fractions of the left ball, the right ball and the floor."""
     return float(chosen[:EACH].mean()), float(chosen[EACH : 2 * EACH].mean()), float(chosen[2 * EACH :].mean())
 
 
 @pytest.fixture(scope="module")
 def touching() -> ClickGraph:
-    """Two balls of different greys that touch."""
+    """Create two touching balls of different greys."""
     return ClickGraph.of(balls((-0.6, 0.9)))
 
 
@@ -115,7 +115,8 @@ def test_three_hundred_thousand_gaussians_take_less_than_two_seconds_for_each_cl
 
 
 def test_floaters_far_from_an_object_do_not_belong_to_it():
-    """Their nearest neighbours are those of the ball, from which empty space separates them."""
+    """Floaters whose nearest neighbours are Gaussians of the ball are not selected with it, because empty space
+    separates them."""
     random = np.random.default_rng(0)
     floaters = random.uniform((-0.9, -0.4, 1.3), (-0.1, 0.4, 1.8), (8, 3))
     beside = np.array([[0.5, 1.6, 0.4], [0.5, -1.6, 0.4]])

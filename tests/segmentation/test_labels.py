@@ -1,4 +1,4 @@
-"""Labels from masks: the closed form has the least error of all labels, and neighbours decide where votes do not."""
+"""Labels from masks: the closed form has the least error of all labellings, and neighbours decide uncertain votes."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from tests.support.scenes import FLOOR, lying, round_ones
 
 
 def test_the_closed_form_has_the_least_error() -> None:
-    """Exhaustive search over all 2^8 labels. The sum over pixels of |mask - rendered labels| is linear in the labels,
-    because weights in a pixel sum to at most one: each Gaussian adds its weight outside the mask if its label is 1, and
-    its weight inside if it is 0.
+    """Compare with an exhaustive search over all 2^8 labellings. The sum over pixels of the absolute difference between
+    mask and rendered labels is linear in the labels, because the weights in a pixel sum to at most one: each Gaussian
+    adds its weight outside the mask if its label is 1, and its weight inside if it is 0.
     """
     random = np.random.default_rng(0)
     inside, outside = random.uniform(0.0, 5.0, (2, 8))
@@ -48,7 +48,7 @@ def test_a_bias_makes_the_object_leaner_or_fuller() -> None:
 
 @pytest.mark.slow
 def test_rough_masks_of_three_views_segment_a_stool() -> None:
-    """The outlines of the masks are off by up to three pixels: the graph cut is right where votes alone are not."""
+    """The outlines of the masks are off by up to three pixels. The graph cut corrects errors of the votes."""
     made = scene("stool")
     cloud, truth = made.whole()
     cameras = ring_cameras(made.plane, np.array([0.0, 0.0, 0.5]), 0.9, count=3, size=256)
@@ -69,13 +69,14 @@ def test_rough_masks_of_three_views_segment_a_stool() -> None:
     assert overlap((wanted | unknown)[nodes]) < 0.9
     assert overlap(smoothed_labels(cloud, votes, nodes, views=3)) > 0.97
     found = segment(cloud, made.plane, ObjectSpec(masks=tuple(masks)))
-    # It is 0.9999. The labels of the votes alone give 0.9985, because the connected parts correct most of their errors.
+    # Measured: 0.9999. With the labels of the votes alone, it would be 0.9985, because the selection of connected parts
+    # corrects most of their errors.
     assert overlap((found.object_mask | found.floater_mask)[nodes]) > 0.999
 
 
 def test_the_confidence_of_a_vote_grows_with_the_root_of_its_pixels() -> None:
-    """One of two similar neighbours is certainly outside, the other is inside by less than the cost of their link:
-    both become outside. Nine times the pixels have three times the weight.
+    """One of two similar neighbours is certainly outside, and the vote for the other to be inside has less weight than
+    their link, so both become outside. Nine times as many pixels have three times the weight.
     """
     pair = round_ones(np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]]), 0.02)
     pixels, share = 9.0 * module._SURE, np.array([0.5 + 0.35 * module._SMOOTHNESS / 3.0, 0.0])
@@ -87,8 +88,8 @@ def test_the_confidence_of_a_vote_grows_with_the_root_of_its_pixels() -> None:
 
 @pytest.mark.parametrize(("pixels", "kept_out"), [(66.0, True), (4.0, False)])
 def test_many_pixels_overrule_the_neighbours(pixels: float, kept_out: bool) -> None:
-    """One Gaussian in a sheet of the object is 62 % outside the masks: with 66 pixels the vote counts, with four
-    it may be due to the edge of the masks.
+    """One Gaussian in a sheet of the object is 62 % outside the masks. With 66 pixels, its vote decides; with four, it
+    may be due to the edge of the masks, and the neighbours decide.
     """
     cloud = lying(level((-0.3, -0.3), (0.3, 0.3), 0.5, 0.03))
     inside, outside = np.full(cloud.count, 20.0), np.zeros(cloud.count)

@@ -19,7 +19,7 @@ NAMES = ("batched_images", "batched_point_coords", "batched_point_labels")
 
 @pytest.fixture(params=["OpenCV", "onnxruntime"])
 def program(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Program that evaluates networks; the second one if it is installed."""
+    """Return the name of the program that evaluates networks: each of two in turn, if it is installed."""
     if request.param == "onnxruntime":
         pytest.importorskip("onnxruntime")
     else:
@@ -123,7 +123,7 @@ def test_a_network_that_fails_is_a_one_line_error() -> None:
 
 
 def test_saliency_is_normalised_to_its_range() -> None:
-    """As in the training of the network: the smallest output is background, the largest is object."""
+    """The output is scaled as in the training of the network: its minimum is background, its maximum is object."""
     answer = np.full((1, 1, 320, 320), 0.1, np.float32)
     answer[..., :160, :] = 0.4
     given: list[Inputs] = []

@@ -1,5 +1,4 @@
-"""The object among the Gaussians of a scene, from masks, a box, a point or a click; clear errors for invalid
-selections."""
+"""Segmentation of the object in a scene, from masks, a box, a point or a click, and errors for invalid selections."""
 
 from __future__ import annotations
 
@@ -65,7 +64,7 @@ def test_floor_remnants_are_left_out() -> None:
 
 
 def test_an_empty_segmentation_is_an_error_of_that_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For every step that may remove the last Gaussian: floor remnants, haze or clicks."""
+    """Each step that may remove the last Gaussian has its own message: floor remnants, haze or clicks."""
     cloud, _ = ball_on_floor()
     spec = ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
     with monkeypatch.context() as patch:
@@ -85,8 +84,8 @@ def test_an_empty_segmentation_is_an_error_of_that_stage(monkeypatch: pytest.Mon
 
 
 def test_fine_specks_of_the_floor_s_colour_are_kept() -> None:
-    """Specks three times as wide as others at the foot, but less than a hundredth of the object, are kept; wider ones
-    of a thirtieth are not."""
+    """Specks at the foot that are three times as wide as others are kept if they are smaller than a hundredth of the
+    object; specks of a thirtieth are removed."""
     thing, floor = shell(), level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05)
     angles = np.linspace(0.0, 5.0, 6)
     specks = np.column_stack([0.3 * np.cos(angles), 0.3 * np.sin(angles), np.full(6, 0.09)])
@@ -145,7 +144,7 @@ def test_impossible_masks_are_reported() -> None:
 
 
 def test_plane_and_object_from_a_click_alone() -> None:
-    """Neither the plane nor the up direction is given."""
+    """The plane and the object are found from a click, without a plane or an up direction."""
     cloud, _ = ball_on_floor()
     located = locate_plane(cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
     assert located.plane.normal[2] > np.cos(np.radians(0.3))
@@ -207,8 +206,8 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     "name", ["pawn", *(pytest.param(name, marks=pytest.mark.slow) for name in ("stool", "figurine"))]
 )
 def test_built_in_scenes_are_segmented(name: str) -> None:
-    """Compared with the true object, everything above the foot is found, and nothing of the room except unseen
-    Gaussians."""
+    """At most 0.1 % of the Gaussians above the foot are missing, and at most 0.1 % of the room, which are hidden
+    Gaussians, are included."""
     made = scene(name)
     cloud, truth = made.whole()
     camera = made.camera(width=200, height=200)
@@ -232,7 +231,8 @@ def test_built_in_scenes_are_segmented(name: str) -> None:
 def test_real_captures_from_one_click(
     data_dir: Path, file: str, click: tuple, normal: tuple, heights: tuple[float, float]
 ) -> None:
-    """The plane is that of the data's own page, which was fitted to the Gaussians, not to rendered depth."""
+    """The plane agrees with the documentation of the data set, in which it was fitted to the Gaussians instead of
+    rendered depth."""
     cloud = read_capture(data_dir / "scenes" / file).cloud
     located = locate_plane(cloud, ObjectSpec(point=np.array(click)))
     unit = np.array(normal) / np.linalg.norm(normal)
@@ -244,22 +244,22 @@ def test_real_captures_from_one_click(
 
 @pytest.mark.parametrize("width", [120.0, 400.0])
 def test_a_click_finds_a_small_object_in_a_large_room(width: float) -> None:
-    """A ball of one unit between distant walls: the guess of its size is halved until it is found."""
+    """For a ball of diameter 1 between distant walls, the guess of its size is halved until the ball is found."""
     cloud, truth = ball_on_floor()
     whole = concatenate(cloud, walls(width, cloud.sh.shape[1]))
     check(whole, np.arange(whole.count) < truth.sum(), ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
 
 
 def walls(width: float, bands: int) -> GaussianCloud:
-    """Return two walls at a distance of ``width``, and of that length."""
+    """Return two walls at a distance of ``width`` from each other; their length is ``width``, too."""
     line = np.linspace(-0.5 * width, 0.5 * width, 60)
     sides = [np.column_stack([np.full(60, x), line, np.full(60, z)]) for x in (line[0], line[-1]) for z in (0.5, 1.5)]
     return round_ones(np.concatenate(sides), 0.135, bands)
 
 
 def test_a_click_finds_a_flat_object_in_a_room() -> None:
-    """A lens with a height of a tenth of its width, between walls 11 apart: with the first guess of its size, half of
-    the room's, it is not found, with half of that it is.
+    """The object is a lens with a height of a tenth of its width, between walls that are 11 apart. It is not found with
+    the first guess of its size, half of the room's, but with half of this guess.
     """
     lens = round_ones(shell() * [1.0, 1.0, 0.1], 0.02)
     whole = concatenate(concatenate(lens, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05))), walls(11.3, 1))
@@ -268,7 +268,7 @@ def test_a_click_finds_a_flat_object_in_a_room() -> None:
 
 
 def test_the_unit_of_length_changes_nothing() -> None:
-    """A ball on its floor, wide floor remnants at its foot, and buried Gaussians under it, in metres and in
+    """A ball with wide floor remnants at its foot and buried Gaussians under it is segmented equally in metres and in
     millimetres."""
     cloud, truth = ball_on_floor()
     angles = np.arange(6)
@@ -312,7 +312,8 @@ def test_only_small_detached_parts_are_floaters() -> None:
 
 
 def test_loose_gaussians_behind_a_hole_belong_to_the_object() -> None:
-    """A hollow ball with a round hole in its side, a tenth of its size wide: loose Gaussians inside belong to it."""
+    """Loose Gaussians inside a hollow ball belong to it, although the ball has a round hole in its side, a tenth of its
+    size wide."""
     skin = shell(3000)
     away = np.linalg.norm(skin - [0.5, 0.0, 0.5], axis=1)
     skin = skin[away > 0.085]
@@ -325,7 +326,7 @@ def test_loose_gaussians_behind_a_hole_belong_to_the_object() -> None:
 
 
 def test_the_floor_closes_a_dome_from_below() -> None:
-    """A dome that stands on its rim, open below: loose Gaussians inside belong to it."""
+    """Loose Gaussians inside a dome that stands on its rim and is open below belong to it."""
     skin = shell(3000)
     dome = skin[skin[:, 2] > 0.5] - [0.0, 0.0, 0.5]
     inside = np.random.default_rng(0).normal(0.0, 0.03, (30, 3)) + [0.0, 0.0, 0.25]
@@ -354,7 +355,8 @@ def test_floor_scatter_is_measured_beside_the_object() -> None:
 
 
 def test_floor_scatter_needs_enough_gaussians() -> None:
-    """Nineteen Gaussians of floor beside the object are too few, twenty are enough."""
+    """The scatter is measured from at least twenty Gaussians of the floor beside the object; with nineteen it is
+    zero."""
     for count, rough in ((19, False), (20, True)):
         place = np.linspace(0.7, 1.2, count)
         floor = np.column_stack([place, np.zeros(count), np.full(count, 0.01)])
@@ -366,8 +368,8 @@ def test_floor_scatter_needs_enough_gaussians() -> None:
 
 
 def test_an_object_hovering_over_the_only_floor_is_accepted_with_a_note() -> None:
-    """A ball above the floor by a fifth of its size, the diagonal of its box, is accepted; at twice the height it is
-    refused."""
+    """A ball is accepted if it hovers a fifth of its size, the diagonal of its box, above the floor; at twice the
+    height it is refused."""
     cloud, truth = ball_on_floor(lift=0.35)
     located = locate_plane(cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.85])), up=FLOOR.normal)
     assert located.segmentation.object_mask[truth].mean() > 0.99

@@ -1,4 +1,4 @@
-"""The plane from rendered depth: closed forms, outliers, several views, clear errors."""
+"""Fit of the plane to rendered depth: closed forms, outliers, several views, and error messages."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_one_view_with_outliers_and_noise(azimuth: float, paper_start: bool) -> 
 
 
 def test_exact_depth_gives_the_exact_plane() -> None:
-    """Eq. (19) without noise: to rounding."""
+    """Eq. (19): without noise, the plane is exact to rounding."""
     camera = camera_over(TRUTH, 0.7)
     depth = plane_depth(TRUTH, camera)
     fit = fit_plane([PlaneView(camera, depth, depth > 0.0)])
@@ -84,8 +84,8 @@ def test_exact_depth_gives_the_exact_plane() -> None:
 
 
 def test_weights_of_one_over_the_residual_reject_outliers() -> None:
-    """Weights of 1 / |residual| turn least squares into least absolute residuals: exact depths of which a fifth are
-    wrong, all to one side, give the exact plane."""
+    """Weights of 1 / abs(residual) turn least squares into least absolute residuals: if a fifth of exact depths are
+    wrong, all to one side, the plane is still exact."""
     camera = camera_over(TRUTH, 0.7)
     depth = plane_depth(TRUTH, camera)
     mask = (depth > 0.0) & (depth < 12.0)
@@ -97,7 +97,7 @@ def test_weights_of_one_over_the_residual_reject_outliers() -> None:
 
 
 def test_several_views_are_fitted_together() -> None:
-    """Eq. (19): three noisy views agree better with the truth than each alone, on average."""
+    """Eq. (19): the fit to three noisy views has a smaller error than the mean error of fits to single views."""
     views = [spoiled_view(TRUTH, azimuth, seed) for seed, azimuth in enumerate((0.0, 2.0, 4.0))]
     alone = [angle(fit_plane([view]).plane, TRUTH) for view in views]
     assert angle(fit_plane(views).plane, TRUTH) < np.mean(alone)
@@ -123,8 +123,8 @@ def test_views_that_cannot_be_fitted_are_reported() -> None:
 
 
 def test_the_loss_of_outliers_has_its_derivatives() -> None:
-    """Tukey's biweight: value, first and second derivative with respect to z, inside the cutoff and beyond, by finite
-    differences.
+    """The first and second derivatives of Tukey's biweight with respect to z equal finite differences, inside and
+    outside the cutoff.
     """
     z, step = np.array([0.05, 0.3, 0.6, 0.9, 1.2, 5.0]), 1e-5
     low, at, high = _tukey(z - step), _tukey(z), _tukey(z + step)

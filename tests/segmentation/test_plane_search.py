@@ -1,5 +1,4 @@
-"""Search for unmarked planes: widest first, from Gaussians parallel to them, as a single patch, where they are
-visible."""
+"""Search for planes: the widest first, from Gaussians that are parallel to them, each a single, visible patch."""
 
 from __future__ import annotations
 
@@ -46,8 +45,8 @@ def test_several_planes_widest_first() -> None:
 
 
 def test_gaussians_parallel_to_a_plane() -> None:
-    """Discs of any thin axis and orientation count within 25 degrees of the plane but not beyond 40; needles and balls
-    do not count.
+    """Discs count as parallel if they are tilted by less than 25 degrees, and not if by more than 40, whichever axis is
+    thin. Needles and balls do not count.
     """
     count = 200
     turns = Rotation.from_quat(np.random.default_rng(0).normal(size=(count, 4)))
@@ -70,7 +69,8 @@ def test_gaussians_parallel_to_a_plane() -> None:
 
 
 def test_a_plane_is_a_single_patch() -> None:
-    """A sheet is one patch; three separate sheets at one level are not, even if another sheet above spans them."""
+    """A sheet is one patch; three separate sheets at one level are not, even if another sheet above covers all of
+    them."""
     one = level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.03)
     apart = np.concatenate([one[:, :3] + [3.0 * k, 0.0, 0.0] for k in range(3)])
     above = level((-1.0, -1.0), (7.0, 1.0), 0.4, 0.03)
@@ -81,7 +81,8 @@ def test_a_plane_is_a_single_patch() -> None:
 
 @pytest.mark.parametrize("scale", [1.0, 10.0])
 def test_further_planes_are_level_in_one_patch_and_elsewhere(scale: float) -> None:
-    """With a table, a floor below and separate shelves at one level, the floor is found, in any unit of length."""
+    """In a scene with a table, a floor below it and separate shelves at one level, the further plane is the floor, in
+    any unit of length."""
     table, floor = level((-0.6, -0.6), (0.6, 0.6), 0.0, 0.03), level((-2.0, -2.0), (2.0, 2.0), -0.8, 0.03)
     shelves = [level((x, y), (x + 0.7, y + 0.7), 0.7, 0.03) for x in (-2.0, 1.3) for y in (-2.0, 1.3)]
     room = lying(np.concatenate([table, floor, *shelves])).scaled(scale)
@@ -90,7 +91,7 @@ def test_further_planes_are_level_in_one_patch_and_elsewhere(scale: float) -> No
 
 
 def test_faint_surfaces_are_no_visible_planes() -> None:
-    """A floor that is opaque on one side of a line and faint on the other: the mask ends at the line."""
+    """If a floor is opaque on one side of a line and faint on the other, the visible plane ends at the line."""
     points = level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.03)
     floor = lying(points)
     faint = GaussianCloud.from_numpy(
@@ -109,7 +110,7 @@ def test_faint_surfaces_are_no_visible_planes() -> None:
 
 @pytest.mark.parametrize(("given", "taken"), [(8, 8), (9, 5), (20, 7)])
 def test_at_most_eight_cameras_are_used(given: int, taken: int) -> None:
-    """They are picked evenly; cameras below the plane are not used."""
+    """The cameras are selected evenly; cameras below the plane are not used."""
     floor = lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05))
     above = ring_cameras(FLOOR, np.zeros(3), 1.0, count=given, elevations=(40.0,), size=32)
     below = Camera.look_at(np.array([0.0, 1.0, -2.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]), width=32, height=32)
@@ -120,8 +121,8 @@ def test_at_most_eight_cameras_are_used(given: int, taken: int) -> None:
 
 
 def test_a_plane_is_refined_equally_in_any_unit_of_length() -> None:
-    """The floor has a scatter of 0.01 in a region of size 1, and a step of 0.05 on one side that does not belong to
-    it."""
+    """The floor has a scatter of 0.01 in a region of size 1. A step of 0.05 on one side, which does not belong to it,
+    changes the plane by less than 0.01."""
     points = level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.03)
     points[:, 2] = np.random.default_rng(1).normal(0.0, 0.01, len(points)) + 0.05 * (points[:, 0] > 0.6)
     fits = []

@@ -1,4 +1,4 @@
-"""Masks from clicks, propagated from view to view, and the detection of masks of other objects."""
+"""Masks from clicks, propagated from view to view; masks of other objects are detected."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TONES = (-1.0, 1.2)
 
 
 class ByTone:
-    """Marks pixels as dark as the first point, and records its inputs."""
+    """Mask model that marks pixels as dark as the first point, and records its inputs."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[np.ndarray, np.ndarray]] = []
@@ -89,7 +89,7 @@ def test_a_view_that_marks_another_object_is_left_out(cameras: list[Camera]) -> 
 
 @pytest.mark.parametrize(("times", "fits"), [(2.9, True), (3.1, False)])
 def test_a_mask_three_times_as_large_is_rejected(cameras: list[Camera], times: float, fits: bool) -> None:
-    """The network marks the region of the first mask about its centre, enlarged by a factor."""
+    """The network marks the region of the first mask enlarged by ``times`` about its centre."""
     cloud = balls(TONES)
     (first,) = masks_from_selection(cloud, np.arange(cloud.count) < 1500, cameras[:1])
     places = np.indices(first.mask.shape).transpose(1, 2, 0)
@@ -134,7 +134,7 @@ def test_clicks_without_a_result_are_reported(cameras: list[Camera]) -> None:
 
 
 def test_prompt_points() -> None:
-    """The innermost pixel of each region, largest region first; none twice, and none in a thin line."""
+    """The points are the innermost pixels of the regions, the largest region first; thin lines have none."""
     mask = np.zeros((60, 100), bool)
     mask[5:46, 5:46], mask[10:31, 60:81], mask[50, 10:90] = True, True, True
     places = _innermost(mask, 3)

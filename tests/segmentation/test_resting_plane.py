@@ -26,7 +26,7 @@ BOX = np.array([1.0, 0.6, 0.5])
 
 
 def leaning(degrees: float) -> np.ndarray:
-    """Return the up direction (3,), rotated about y."""
+    """Return the up direction (3,), rotated about y by ``degrees``."""
     angle = np.radians(degrees)
     return np.array([np.sin(angle), 0.0, np.cos(angle)])
 
@@ -41,7 +41,7 @@ def skin_of_box(count: int = 3000) -> np.ndarray:
 
 
 def box_on_haze(degrees: float) -> GaussianCloud:
-    """Return the box, and a tilted sheet of haze through its foot."""
+    """Return the box and a sheet of haze through its foot that is tilted by ``degrees``."""
     normal = leaning(degrees)
     haze = level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.1)
     haze[:, 2] = 0.05 - haze[:, 0] * normal[0] / normal[2]
@@ -56,7 +56,8 @@ def degrees_between(one: np.ndarray, other: np.ndarray) -> float:
 
 @pytest.mark.parametrize("off", [0.0, 3.0, 8.0])
 def test_a_box_rests_on_its_underside(off: float) -> None:
-    """The initial plane may cut through the box, up may be off by ``off`` degrees, and some strays are below."""
+    """The plane is found although the initial plane cuts through the box, its up direction is off by ``off`` degrees,
+    and some strays are below."""
     skin = skin_of_box()
     strays = np.random.default_rng(0).uniform(-0.4, 0.4, (8, 3)) * [1.0, 1.0, 0.2] - [0.0, 0.0, 0.1]
     cloud = round_ones(np.concatenate([skin, strays]), 0.008)
@@ -69,7 +70,8 @@ def test_a_box_rests_on_its_underside(off: float) -> None:
 
 @pytest.mark.parametrize("off", [-9.0, -5.0, 5.0])
 def test_the_direction_is_finer_than_the_first_search(off: float) -> None:
-    """The first search tries directions 1.4 degrees apart."""
+    """The error of the direction is less than 0.15 degrees, although the first search tries directions 1.4 degrees
+    apart."""
     cloud = round_ones(skin_of_box(), 0.008)
     found = resting_plane(cloud, np.ones(cloud.count, bool), FLOOR, leaning(off), degrees=10.0, size=1.3)
     assert degrees_between(found.normal, UP) < 0.15
@@ -77,7 +79,7 @@ def test_the_direction_is_finer_than_the_first_search(off: float) -> None:
 
 @pytest.mark.parametrize("mirror", [(-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
 def test_a_mirrored_object_rests_on_the_mirrored_plane(mirror: tuple[float, float, float]) -> None:
-    """No side is preferred, for any shape."""
+    """The search prefers no side: for mirrored objects, the planes are mirrored, too."""
     for seed in range(8):
         points = np.random.default_rng(seed).normal(size=(600, 3)) * [0.3, 0.2, 0.1] + [0.0, 0.0, 0.5]
         found, other = (
@@ -89,7 +91,8 @@ def test_a_mirrored_object_rests_on_the_mirrored_plane(mirror: tuple[float, floa
 
 
 def test_a_mirror_image_in_a_glossy_table_carries_nothing() -> None:
-    """A box stands on feet 0.3 high, with as many Gaussians 0.6 below them, as in a reflection."""
+    """A box stands on feet of height 0.3; as many Gaussians are 0.6 below them, as in a reflection. The plane is under
+    the feet."""
     skin = skin_of_box() + [0.0, 0.0, 0.3]
     feet = np.concatenate([skin_of_box(300) * [0.1, 0.1, 0.6] + [x, y, 0.0] for x in (-0.4, 0.4) for y in (-0.2, 0.2)])
     image = skin_of_box() * [1.0, 1.0, -1.0] - [0.0, 0.0, 0.6]
@@ -119,7 +122,7 @@ def found_on(cloud: GaussianCloud) -> LocatedPlane:
 
 
 def test_a_tilted_visible_surface_is_replaced_by_the_resting_plane() -> None:
-    """A surface tilted by 8 degrees is haze; one tilted by 3 degrees is a table."""
+    """A visible surface that is tilted by 8 degrees counts as haze, and one tilted by 3 degrees as a table."""
     laid, seen = found_on(box_on_haze(8.0)), found_on(box_on_haze(3.0))
     assert not laid.in_sight and laid.fit is None and seen.in_sight
     assert "laid under the object's lowest parts" in laid.notes[-1]
@@ -130,7 +133,7 @@ def test_a_tilted_visible_surface_is_replaced_by_the_resting_plane() -> None:
 
 
 def test_low_remnants_on_haze_are_dropped_and_haze_stays() -> None:
-    """Remnants near the foot and low are dropped, distant ones are not, and none if a table is visible."""
+    """Low remnants near the foot are removed, distant ones are not; if a table is visible, none are."""
     at = np.array([[0.54, 0.1, 0.04], [0.52, -0.1, 0.03], [1.6, 0.9, 0.0]])
     shreds = round_ones(at, 0.01)
     for degrees, dropped in ((8.0, [True, True, False]), (3.0, [False, False, False])):
@@ -145,7 +148,7 @@ def test_low_remnants_on_haze_are_dropped_and_haze_stays() -> None:
 
 
 def test_haze_is_not_filled() -> None:
-    """A floor that was not visible would be painted in the air."""
+    """If the plane is not visible, the floor is not inpainted, because its position is uncertain."""
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.25]), 0.9, count=8, elevations=(20.0, 50.0), size=200)
     spec = ObjectSpec(point=np.array([0.0, 0.0, 0.45]))
     scene = prepare_scene(
@@ -156,7 +159,8 @@ def test_haze_is_not_filled() -> None:
 
 
 def test_haze_within_an_object_is_dropped() -> None:
-    """Haze does not belong to the object, and in the background it would look like a ghost of the object."""
+    """Haze inside an object belongs neither to the object nor to the background, in which it would show the outline of
+    the object."""
     cloud, truth = ball_on_floor()
     where = np.array([[0.0, 0.1, 0.6], [0.1, 0.0, 0.4]])
     haze = round_ones(where, 0.2)

@@ -1,4 +1,4 @@
-"""Visible surfaces of an image: positions by heights are on the floor; positions by depths are biased upwards."""
+"""Visible surfaces of an image: positions from heights are on the floor; positions from depths are biased upwards."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SPACING = 0.03
 
 @pytest.fixture(scope="module")
 def floor_view() -> SeenSurface:
-    """A floor, viewed from 30 degrees above it."""
+    """Create a view of a floor from an elevation of 30 degrees."""
     eye = np.array([0.0, -2.2, 1.3])
     camera = Camera.look_at(
         eye, np.zeros(3), np.array([0.0, 0.0, 1.0]), width=120, height=120, vertical_fov_degrees=30.0
@@ -38,7 +38,7 @@ def test_heights_are_right_where_depths_are_too_high(floor_view: SeenSurface) ->
 
 
 def test_a_rough_plane_is_sufficient(floor_view: SeenSurface) -> None:
-    """For a plane tilted by two degrees, the error is the width of a splat times the sine of the tilt."""
+    """For a plane tilted by two degrees, the error is at most the width of a splat times the sine of the tilt."""
     tilt = np.radians(2.0)
     rough = Plane(np.array([0.0, np.sin(tilt), np.cos(tilt)]), 0.02)
     points = floor_view.points(rough, floor_view.opaque)
@@ -46,7 +46,7 @@ def test_a_rough_plane_is_sufficient(floor_view: SeenSurface) -> None:
 
 
 def test_pixels_without_a_surface_have_no_depth(floor_view: SeenSurface) -> None:
-    """Empty pixels, rays at or above the horizon, and a plane above the camera."""
+    """The depth is zero for empty pixels, for rays at or above the horizon, and for a plane above the camera."""
     up = Camera.look_at(
         np.array([0.0, -1.0, 0.5]), np.array([0.0, 1.0, 0.9]), np.array([0.0, 0.0, 1.0]), width=64, height=64
     )

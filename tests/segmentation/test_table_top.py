@@ -119,8 +119,8 @@ def on_surface(points: np.ndarray, spacing: float, cover: float) -> float:
 
 
 def test_surface_around_measures_the_extent_of_the_surface() -> None:
-    """The extent is half on a table whose edge runs under the ball's centre; one if Gaussians cover enough of the area
-    and zero if less; and nearly zero if they begin a cell farther out.
+    """The surface extends half-way around a ball whose centre is over the edge of a table. It extends all around if
+    Gaussians cover enough of the area, and nowhere if they cover less or begin a cell farther out.
     """
     spacing, enough = 0.02, module._COVERED
     half, whole = (level((left, -1.0), (1.0, 1.0), 0.0, spacing) for left in (0.0, -1.0))

@@ -1,4 +1,4 @@
-"""Votes by blending weight against a slow, obvious reference; masks of the wrong size."""
+"""Votes by blending weights, against a slow reference; masks of a wrong size."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ def camera() -> Camera:
 
 
 def test_votes_are_the_blending_weights(device: str) -> None:
-    """A render of one white Gaussian among black ones shows its blending weight in each pixel."""
+    """The votes of a Gaussian equal the sums of its blending weights, which are rendered with it white and all others
+    black."""
     cloud, view = random_cloud(device), camera()
     mask = np.zeros((view.height, view.width), bool)
     mask[10:25, 20:45] = True
@@ -55,7 +56,7 @@ def test_votes_are_the_blending_weights(device: str) -> None:
 
 
 def test_a_hidden_gaussian_has_little_weight(device: str) -> None:
-    """Two equal Gaussians one behind the other: the front one is fully visible, the other one hardly at all."""
+    """If two equal Gaussians are one behind the other, the front one is almost fully visible, the other one is not."""
     cloud = GaussianCloud.from_numpy(
         np.array([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.7, 0.0, 0.0]]),
         np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)),
@@ -77,8 +78,8 @@ def test_a_mask_of_another_size_is_refused() -> None:
 
 
 def test_gaussians_outside_the_image_have_no_weight() -> None:
-    """Gaussians behind the camera or far to the side have none, regardless of what hides them; one in a single tile
-    counts."""
+    """Gaussians behind the camera or far to the side have zero weight, also without occlusion. A Gaussian in a single
+    tile has weight."""
     means = np.array([[0.0, 0.0, 0.0], [0.0, -9.0, 0.0], [40.0, 0.0, 0.0]])
     cloud = GaussianCloud.from_numpy(
         means, np.tile([1.0, 0, 0, 0], (3, 1)), np.full((3, 3), -4.0), np.full(3, 2.0), np.zeros((3, 1, 3))

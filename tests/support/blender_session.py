@@ -1,6 +1,6 @@
-"""Run by the Python of Blender's module: install the extension, import a run, play it, edit muscles and render.
+"""Script for Blender's Python: install the extension, import a run, play it, edit muscles and render.
 
-Arguments: the extension, the run or bundle, a folder for the results, the frame. Prints what is tested as JSON.
+Arguments: the extension, the run or bundle, a folder for the results, and the frame. The results are written as JSON.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ ATTRIBUTES = (
 
 
 def evaluated_splats(splats: Any) -> dict[str, np.ndarray]:
-    """Return positions and attributes as other add-ons read them: from the evaluated mesh."""
+    """Return positions and attributes of the evaluated mesh, which other add-ons read."""
     mesh = splats.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
     arrays = {"positions": np.empty(3 * len(mesh.vertices), np.float32)}
     mesh.vertices.foreach_get("co", arrays["positions"])
@@ -35,7 +35,7 @@ def positions(part: Any) -> list[list[float]]:
 
 
 def edit(root: Any) -> None:
-    """Remove the first muscle and move the second one a little; draw one more; widen the cage, as a user would."""
+    """Edit the run like a user: remove the first muscle, move the second one, draw another one, and widen the cage."""
     (home,) = root.users_collection
     (rest,) = home.children
     (cage,) = (thing for thing in rest.objects if thing.type == "MESH")

@@ -1,4 +1,4 @@
-"""A small bundle of two bodies: a block that swings, and static splats."""
+"""A small bundle of two bodies: a moving block and static splats."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.support.captures import small_cloud
 from tests.support.meshes import block_mesh
 
 FRAMES = 130
-"""Number of frames: more than two blocks."""
+"""Number of frames; the bundle stores them in two full blocks of 60 and a shorter one."""
 
 
 def small_bundle() -> Bundle:
@@ -45,19 +45,19 @@ def small_bundle() -> Bundle:
 
 @cache
 def bundle_bytes() -> bytes:
-    """Return the file of ``small_bundle``."""
+    """Return the bytes of the file of ``small_bundle``."""
     with tempfile.TemporaryDirectory() as folder:
         write_bundle(Path(folder) / "a.egs", small_bundle())
         return (Path(folder) / "a.egs").read_bytes()
 
 
 def text_of(data: bytes) -> dict[str, Any]:
-    """Return the JSON text of a file."""
+    """Return the parsed JSON text of a bundle file."""
     return json.loads(data[HEAD.size : HEAD.size + HEAD.unpack_from(data)[2]])
 
 
 def with_text(text: bytes) -> bytes:
-    """Return the file of ``small_bundle`` with another JSON text."""
+    """Return the bytes of the file of ``small_bundle`` with another JSON text."""
     data = bundle_bytes()
     magic, version, length = HEAD.unpack_from(data)
     return HEAD.pack(magic, version, len(text)) + text + data[HEAD.size + length :]

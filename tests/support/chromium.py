@@ -1,4 +1,4 @@
-"""The system's Chromium, which renders in software on a machine without a GPU."""
+"""Tests in the system's Chromium, which renders in software on a machine without a GPU."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def opened(
     scripts: Sequence[str] = (),
     **context: Any,
 ) -> tuple[Any, list[str]]:
-    """Open a page and wait until it is loaded; returns the page and the list of the browser's errors and warnings.
+    """Open a page and wait until it is loaded; return the page and the list of the browser's errors and warnings.
 
     Unless ``plays`` is true, a recorded run is stopped at its first frame. ``scripts`` run before those of the page;
     ``context`` has further settings of the browser, such as ``color_scheme``.

@@ -15,7 +15,8 @@ SPAN = 1.0
 
 
 def balls(tones: tuple[float, float], between: float = SPAN) -> GaussianCloud:
-    """Two balls of diameter 1 on a floor, each in its own grey; each has 1500 Gaussians, the left one first."""
+    """Return two balls of diameter 1 on a floor, with 1500 Gaussians each, the left one first. ``tones`` are their
+    greys, ``between`` is the distance of their centres."""
     skin = shell()
     left, right = skin - [0.5 * between, 0.0, 0.0], skin + [0.5 * between, 0.0, 0.0]
     cloud = concatenate(
@@ -29,7 +30,7 @@ def balls(tones: tuple[float, float], between: float = SPAN) -> GaussianCloud:
 
 
 def front(width: int = 200) -> Camera:
-    """Camera that shows both balls from the front."""
+    """Return a camera that shows both balls from the front."""
     eye = np.array([0.0, -5.0, 1.2])
     return Camera.look_at(eye, np.array([0.0, 0.0, 0.4]), np.array([0.0, 0.0, 1.0]), width=width, height=width)
 

@@ -9,7 +9,8 @@ from egs_warp.geometry.tetmesh import TetMesh
 
 
 def surface_cloud(mesh: TetMesh, count: int, *, lowest: float = 0.0, scale: float = 0.01) -> GaussianCloud:
-    """Scatter Gaussians of random rotation over the mesh's surface, with means clamped to at least ``lowest``."""
+    """Return ``count`` Gaussians with random rotations on the surface of the mesh; the heights of their means are at
+    least ``lowest`` m."""
     rng = np.random.default_rng(0)
     faces = mesh.boundary_faces()
     shares = rng.dirichlet([1.0, 1.0, 1.0], count)

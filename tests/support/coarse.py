@@ -14,7 +14,7 @@ from egs_warp.cli import main
 from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 
 NODES = 60
-"""Default number of nodes, without ``EGS_WARP_TEST_NODES``."""
+"""Number of nodes if ``EGS_WARP_TEST_NODES`` is not set."""
 
 
 def coarse_maker(nodes: int) -> Callable[..., Creature]:
@@ -34,7 +34,7 @@ def coarse_cages(nodes: int) -> Iterator[None]:
 
 
 def coarse_main(arguments: Sequence[str] | None = None) -> int:
-    """Run ``egs-warp`` with these arguments, or with the process's own; returns its exit status."""
+    """Run ``egs-warp`` with these arguments, or those of the process, and coarse cages; return its exit status."""
     with coarse_cages(int(os.environ.get("EGS_WARP_TEST_NODES", NODES))):
         return main(arguments)
 

@@ -1,4 +1,4 @@
-"""Error of a second process that requests a file while the first one writes it."""
+"""A second process that requests a file while the first one writes it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from egs_warp.errors import UserError
 
 
 def error_of_second_process(enter: Callable[[Path], AbstractContextManager[Any]], path: Path) -> str | None:
-    """Return the error of another process that enters ``path``; None if it succeeds."""
+    """Return the error of another process that enters the context ``enter(path)``, or None if it succeeds."""
     context = multiprocessing.get_context("spawn")
     answers = context.Queue()
     other = context.Process(target=_try, args=(enter, path, answers))

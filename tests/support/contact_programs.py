@@ -17,14 +17,14 @@ FRICTION = 0.8
 
 @dataclass(frozen=True)
 class SmallProblem:
-    """A program and its mechanics; units of weight and speed are 1."""
+    """The same contact problem with the Coulomb cone and with a friction pyramid; weight and unit of speed are 1."""
 
     coulomb: CoulombProgram
     pyramid: PyramidProgram
     shift: np.ndarray
 
     def velocities(self, y: np.ndarray) -> np.ndarray:
-        """(n, 3) contact velocities at the solution ``y``."""
+        """Return the contact velocities (n, 3) at the solution ``y``, normal first."""
         velocities = (self.coulomb.rows @ self.pyramid.forces_of(y) + self.coulomb.offset).reshape(-1, 3)
         velocities[:, 0] -= self.shift
         return velocities
@@ -39,7 +39,8 @@ def small_problem(
     freedoms: int = 8,
     frame: np.ndarray | None = None,
 ) -> SmallProblem:
-    """Build v = base + R a + J^T f with a random J whose normals share a direction, and a random target velocity.
+    """Build a problem with v = base + R a + J^T f, a random J whose normals have a common direction, and a random
+    target velocity.
 
     ``frame`` replaces J.
     """

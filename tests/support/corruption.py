@@ -1,4 +1,4 @@
-"""Corrupted files: Hypothesis strategies for the tests, and for Atheris (``tests/fuzz.py``)."""
+"""Hypothesis strategies for corrupted files, for the tests and for Atheris (``tests/fuzz.py``)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def damaged(reader: Reader) -> st.SearchStrategy[bytes]:
 def _damaged_bytes(draw: st.DrawFn, good: bytes) -> bytes:
     data = bytearray(good)
     for _ in range(draw(st.integers(0, 6))):
-        # Half of the corruptions are in the first 64 bytes, because those of headers have the largest effect.
+        # Half of the corruptions are in the first 64 bytes, because corrupted headers have the largest effect.
         place = draw(st.integers(0, max(len(data) - 1, 0)) | st.integers(0, min(len(data), 64)))
         match draw(st.integers(0, 5)):
             case 0:

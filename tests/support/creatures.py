@@ -25,20 +25,21 @@ from tests.support.stances import DT, FLOOR
 
 @cache
 def coarse_pawn(*, friction: float = 0.8, device: str = "cpu") -> Creature:
-    """The built-in pawn with few Gaussians, in a cage of about 50 nodes, built once per process."""
+    """Return the built-in pawn with few Gaussians, in a cage of about 50 nodes; it is built once per process."""
     scene = pawn(gaussian_count=3000, device=device)
     return make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=50, friction=friction))
 
 
 def sagging(creature: Creature) -> Creature:
-    """Return the creature with its captured shape as the unloaded one: it sags until most of its base touches."""
+    """Return the creature with the captured shape as its unloaded shape, settled: it sags until most of its base
+    touches the ground."""
     stepper = creature.stepper.with_unloaded_shape(creature.body.mesh.nodes)
     return replace(creature, stepper=stepper, start=settle(stepper))
 
 
 @dataclass(frozen=True)
 class CoarseCreature:
-    """A stepper, the stance of its body, and its state there."""
+    """A stepper, the stance of its body, and the state of the body in this stance."""
 
     stepper: LocomotionStepper
     place: Stance
@@ -56,10 +57,11 @@ def coarse_creature(
     field: HeightField | None = None,
     all_round: bool = False,
 ) -> CoarseCreature:
-    """Build a body of ``mesh`` on its lowest nodes, facing ``forward`` (3,); ``up`` (3,) is opposite to gravity.
+    """Build a body of ``mesh`` that stands on its lowest nodes and faces ``forward`` (3,); ``up`` (3,) is opposite to
+    gravity.
 
-    With a ``field`` in place of the floor, all of its base may touch the ground; with ``all_round``, any node of its
-    surface.
+    Contact points are the nodes of its base. With a ``field`` in place of the floor, they are a grid on its base; with
+    ``all_round``, all nodes of its surface.
     """
     body = make_body(mesh, FLOOR, up=up, sag=sag, device="cpu")
     muscles = automatic_muscles(

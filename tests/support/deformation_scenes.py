@@ -11,7 +11,7 @@ from egs_warp.geometry.tetmesh import TetMesh
 
 
 def box(cells: tuple[int, int, int] = (3, 3, 3), size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> TetMesh:
-    """A box cage with slightly jittered inner nodes, so that the Delaunay tetrahedralisation is unique."""
+    """Return a box cage with slightly perturbed inner nodes, so that the Delaunay tetrahedralisation is unique."""
     axes = [np.linspace(0, length, count + 1) for count, length in zip(cells, size, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     jitter = np.random.default_rng(0).uniform(-0.06, 0.06, nodes.shape) * (np.array(size) / cells)
@@ -37,7 +37,7 @@ def random_cloud(
 
 
 def matrices(cloud: GaussianCloud) -> np.ndarray:
-    """(n, 3, 3) float64 rotation matrices [r1 r2 r3]."""
+    """Return the rotation matrices [r1 r2 r3] (n, 3, 3) of the Gaussians, float64."""
     return Rotation.from_quat(cloud.rotations.numpy().astype(np.float64)[:, [1, 2, 3, 0]]).as_matrix()
 
 
@@ -47,7 +47,7 @@ def covariances(cloud: GaussianCloud) -> np.ndarray:
 
 
 def bent(points: np.ndarray, radius: float) -> np.ndarray:
-    """Bend a bar along x onto a circle of ``radius`` around the y axis."""
+    """Return the points of a bar along x, bent onto a circle of ``radius`` about an axis parallel to y."""
     angle = points[:, 0] / radius
     r = radius - (points[:, 2] - 0.2)
     return np.stack([r * np.sin(angle), points[:, 1], radius - r * np.cos(angle)], axis=1)

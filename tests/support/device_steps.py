@@ -1,4 +1,4 @@
-"""Steppers with matrices in device memory: on a GPU, or on a CPU with a GPU's kernels."""
+"""Steppers with matrices in device memory: on a GPU, or on a CPU with the kernels for GPUs."""
 
 from __future__ import annotations
 

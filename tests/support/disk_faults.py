@@ -21,7 +21,8 @@ RENAMING = ("egs_warp.io.atomic", "egs_warp.pipelines.pose_photos")
 def largest_file(size: int) -> Iterator[None]:
     """Limit files to ``size`` bytes, as on a full disk; started programs inherit the limit.
 
-    Python writes no bytecode meanwhile: a library imported for the first time would leave a truncated file behind.
+    Python writes no bytecode within the block, because a library that is imported for the first time would leave a
+    truncated file behind.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     with pytest.MonkeyPatch.context() as patch:
@@ -35,16 +36,17 @@ def largest_file(size: int) -> Iterator[None]:
 
 
 def assert_one_line(said: str, reason: str) -> None:
-    """Assert that the last line is the error; earlier lines are progress."""
+    """Assert that the last line is the error message with the ``reason``; earlier lines may show progress."""
     assert "Traceback" not in said
     assert said.splitlines()[-1].startswith("egs-warp: ") and reason in said.splitlines()[-1], said
 
 
 def fail_once(patch: pytest.MonkeyPatch, number: int, reason: int) -> list[Path]:
-    """Make the call with this ``number``, from 0, fail among openings of new files and renamings in ``RENAMING``.
+    """Make the call with this ``number``, from 0, fail with ``reason``; openings of new files and renamings in
+    ``RENAMING`` are counted.
 
     Returns:
-        list that receives the path of the failed call.
+        A list that receives the path of the failed call.
     """
     failed: list[Path] = []
     calls = count()

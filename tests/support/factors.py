@@ -1,4 +1,4 @@
-"""Factorisations of tests."""
+"""Factorisation of matrices and tests of its status."""
 
 from __future__ import annotations
 

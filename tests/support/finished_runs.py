@@ -1,4 +1,4 @@
-"""A small run in the format of ``animate``, corrupted inside its checksums, for the readers of runs."""
+"""A small run in the format of ``animate``, whose arrays can be corrupted without a wrong checksum."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.support.slides import slide
 
 @cache
 def finished_run() -> dict[str, bytes]:
-    """Files of a run of 24 steps of a block that is thrown and struck."""
+    """Return the files, by name, of a run of 24 steps of a block that is thrown and struck."""
     slid = slide(struck=True)
     camera = Camera.look_at(np.array([3.0, 0.0, 1.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]), width=32, height=24)
     with tempfile.TemporaryDirectory() as place:
@@ -32,9 +32,9 @@ def finished_run() -> dict[str, bytes]:
 
 
 def arrays_as_json(name: str) -> bytes:
-    """Return the arrays of a file of the run as JSON, whose leaves can be corrupted one by one.
+    """Return the arrays of a file of the run as JSON, so that single values can be corrupted.
 
-    Empty arrays are left out, because JSON does not store their shape.
+    Empty arrays are left out, because JSON does not store their shapes.
     """
     with np.load(io.BytesIO(finished_run()[name]), allow_pickle=False) as arrays:
         return json.dumps({key: arrays[key].tolist() for key in arrays.files if arrays[key].size}).encode()

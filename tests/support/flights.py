@@ -1,4 +1,4 @@
-"""A hand-written trajectory: a rigid block in the air."""
+"""A trajectory without simulation: a rigid block in flight."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 def rigid_flight() -> Trajectory:
     """Return the flight of a block that takes off with (1, 0, 2) m/s and rotates about the vertical.
 
-    Its velocities follow the implicit integrator's own rule.
+    The centre of mass satisfies implicit Euler; the velocities do not include the rotation.
     """
     mesh = block_mesh()
     mass = mesh.lumped_masses(1000.0)

@@ -1,4 +1,4 @@
-"""Painted floors for the tests of inpainting: an exactly periodic pattern on a slanted plane."""
+"""Floors for the tests of inpainting: a periodic pattern on an inclined plane."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PERIOD = 0.4
 
 
 def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(..., 3) checks with soft edges and a stripe, of period 0.4 in both directions."""
+    """Return colours (..., 3) of checks with soft edges and a stripe, with a period of 0.4 in both directions."""
     u, v = 2.0 * np.pi * x / PERIOD, 2.0 * np.pi * y / PERIOD
     checks = np.tanh(3.0 * np.sin(u) * np.sin(v))
     return np.stack([0.5 + 0.3 * checks, 0.5 - 0.2 * checks, 0.45 + 0.15 * np.cos(u)], axis=-1)
@@ -41,11 +41,11 @@ def floor(
 
 
 def centre() -> np.ndarray:
-    """(3,) origin of the pattern on the plane."""
+    """Return the origin (3,) of the pattern on the plane."""
     return -PLANE.offset * PLANE.normal
 
 
 def on_plane(x: float, y: float) -> np.ndarray:
-    """(3,) point of the plane at pattern coordinates."""
+    """Return the point (3,) of the plane at the pattern coordinates ``x`` and ``y``."""
     first, second = PLANE.tangents()
     return centre() + x * first + y * second

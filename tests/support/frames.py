@@ -1,4 +1,4 @@
-"""The same capture in other coordinates: shuffled, in another unit, moved, rotated."""
+"""The same capture with other file contents: shuffled, in another unit, translated or rotated."""
 
 from __future__ import annotations
 

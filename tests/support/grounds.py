@@ -23,14 +23,14 @@ def sheet(points: np.ndarray, normals: np.ndarray, spacing: float, colour: tuple
 
 
 def level(low: tuple[float, float], high: tuple[float, float], height: float, spacing: float) -> np.ndarray:
-    """(n, 3) points of a rectangle at ``height``."""
+    """Return points (n, 3) of a rectangle at ``height``."""
     sides = [np.arange(a + 0.5 * spacing, b, spacing) for a, b in zip(low, high, strict=True)]
     flat = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     return np.column_stack([flat, np.full(len(flat), height)])
 
 
 def ball(lift: float = 0.0) -> GaussianCloud:
-    """A ball that touches z = ``lift``."""
+    """Return a ball that touches z = ``lift``."""
     random = np.random.default_rng(3)
     normals = random.normal(size=(5000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -38,7 +38,8 @@ def ball(lift: float = 0.0) -> GaussianCloud:
 
 
 def furnished_room() -> GaussianCloud:
-    """A ball on a table of 2.4 x 2 with its top at z = 0; a floor of 8 x 8 at z = -1.5, a cupboard and a wall."""
+    """Return a ball on a table of 2.4 x 2 with its top at z = 0, a floor of 8 x 8 at z = -1.5, a cupboard and a
+    wall."""
     up = np.array([[0.0, 0.0, 1.0]])
 
     def flat(points: np.ndarray, spacing: float, colour: tuple[float, float, float]) -> GaussianCloud:

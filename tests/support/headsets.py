@@ -1,4 +1,4 @@
-"""An emulated headset with two controllers, made of the npm package iwer."""
+"""An emulated headset with two controllers, by the npm package iwer."""
 
 from __future__ import annotations
 

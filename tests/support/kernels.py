@@ -75,7 +75,8 @@ def algebra_kernel(
 def iterate_kernel(
     rows: UnitConstraints, holding: ActiveSet, splitting: Splitting, guessed: wp.array[int], ended: wp.array[int]
 ):
-    """Run OSQP's iterations, store the sides of the constraints that they give in ``guessed``, and find the optimum."""
+    """Run OSQP's iterations, store the guessed side of each constraint in ``guessed``, and search the optimum from
+    there."""
     iterate(rows, holding, splitting)
     for row in range(algebra.lane_of_block(), rows.count, wp.block_dim()):
         guessed[row] = holding.side[row]

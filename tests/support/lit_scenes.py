@@ -9,11 +9,11 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 
 RADIUS = 0.5
 AMBIENT = 0.5
-"""Irradiance without the light; the light gives ``1 - AMBIENT`` to a surface that faces it."""
+"""Ambient irradiance; the light adds ``1 - AMBIENT`` on a surface that faces it."""
 
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:
-    """(3,) unit vector to a light, from degrees."""
+    """Return the unit vector (3,) to a light, for ``azimuth`` and ``elevation`` in degrees."""
     a, e = np.radians([azimuth, elevation])
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
@@ -39,7 +39,8 @@ def lit_floor(light: np.ndarray, *, key: float = 1.0 - AMBIENT, albedo: float = 
 
 
 def in_shadow(points: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """(n,) bool, True where the ray from ``points`` (n, 3) of the floor to the light meets the ball."""
+    """Return (n,) bool: True where the ray from a point of the floor, ``points`` (n, 3), to the light meets the
+    ball."""
     away = points - [0.0, 0.0, RADIUS]
     along = away @ light
     return (along < 0.0) & ((away * away).sum(axis=1) - along * along < RADIUS**2)

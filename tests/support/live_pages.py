@@ -21,11 +21,11 @@ KEEP_SENT = """() => {
     window.sent = [];
     source.send = (message) => { window.sent.push(message); send(message); };
 }"""
-"""Script that records the page's requests from then on."""
+"""JavaScript that records the page's requests from the time at which it runs."""
 
 
 def in_browser(test: Any) -> Any:
-    """Apply the marks of a test in Chromium."""
+    """Decorator that applies the marks of a test in Chromium."""
     for mark in NEEDED:
         test = mark(test)
     return test
@@ -33,7 +33,7 @@ def in_browser(test: Any) -> Any:
 
 @contextmanager
 def living(session: Session, **place: Any) -> Iterator[PageServer]:
-    """Run the server of a live session."""
+    """Run the server of a live session within the block."""
     with served(feed=LiveFeed(session), **place) as server:
         yield server
 

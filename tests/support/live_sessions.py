@@ -1,4 +1,4 @@
-"""A coarse creature in a live session, stepped by the test or in its own thread."""
+"""A coarse creature in a live session, which is stepped by the test or in its own thread."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from egs_warp.web.session import Session, SessionOptions
 
 @cache
 def coarse_pawn() -> Creature:
-    """The built-in pawn in a cage of about a hundred nodes."""
+    """Return the built-in pawn in a cage of about a hundred nodes."""
     scene = pawn(gaussian_count=2000)
     return make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=50))
 
@@ -37,7 +37,7 @@ class SteppedSession:
         self.news: list[dict[str, Any]] = []
 
     def request(self, kind: str, **fields: Any) -> None:
-        """Send a request, as the page would."""
+        """Send a request in the way of the page."""
         body = self.session.creature.body
         message = read_message({"type": kind, **fields}, height=body.height, node_count=len(body.node_mass))
         self.session.put_request(message)
@@ -51,7 +51,7 @@ class SteppedSession:
             self._hear()
 
     def until(self, condition: Callable[[], bool], *, max_steps: int = 400) -> int:
-        """Step until ``condition`` holds; returns the number of steps."""
+        """Step until ``condition`` holds; return the number of steps."""
         for count in range(max_steps):
             if condition():
                 return count
@@ -65,7 +65,7 @@ class SteppedSession:
 
     @property
     def messages(self) -> list[str]:
-        """Messages for the user."""
+        """The messages that the session has sent to the user."""
         return [str(news["text"]) for news in self.news if news["type"] == "told"]
 
     def _hear(self) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 _IMPORTS = ("numpy", "warp", "cv2", "PIL.Image", "PIL.WebPImagePlugin", "PIL.PngImagePlugin", "egs_warp.io")
-"""Modules whose memory is not counted."""
+"""Modules that are imported before the measurement, so that their memory is not counted."""
 _MAX_SECONDS = 60.0
 
 

@@ -13,7 +13,8 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def block_mesh(nx: int = 3, ny: int = 3, nz: int = 5, size: tuple[float, float, float] = (0.4, 0.4, 1.0)) -> TetMesh:
-    """A box centred on the z axis, standing on z = 0: nx x ny x nz nodes, six tetrahedra per cell, irregular inside."""
+    """Return a box on z = 0 centred on the z axis, with nx x ny x nz nodes and six tetrahedra per cell; inner nodes are
+    perturbed."""
     axes = [np.linspace(-size[0] / 2, size[0] / 2, nx), np.linspace(-size[1] / 2, size[1] / 2, ny)]
     axes.append(np.linspace(0, size[2], nz))
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
@@ -35,7 +36,7 @@ def block_mesh(nx: int = 3, ny: int = 3, nz: int = 5, size: tuple[float, float, 
 
 
 def box_mesh(counts: tuple[int, int, int], size: tuple[float, float, float]) -> TetMesh:
-    """A box with its base centred at the origin, each of its cells cut into six tetrahedra."""
+    """Return a box with its base centred at the origin and six tetrahedra per cell."""
     grid = np.stack(np.meshgrid(*[np.arange(n + 1) for n in counts], indexing="ij"), axis=-1)
     nodes = (grid / np.array(counts) * np.array(size) - [size[0] / 2, size[1] / 2, 0.0]).reshape(-1, 3)
     index = np.arange(len(nodes)).reshape(grid.shape[:3])
@@ -51,7 +52,7 @@ def box_mesh(counts: tuple[int, int, int], size: tuple[float, float, float]) -> 
 
 
 def carved(size: tuple[float, float, float], cell: float, keep: Callable[[np.ndarray], np.ndarray]) -> TetMesh:
-    """Cells of a lattice over a box on z = 0 whose centres ``keep`` accepts, six tetrahedra each."""
+    """Return the cells of a lattice over a box on z = 0 whose centres ``keep`` accepts, with six tetrahedra each."""
     counts = np.round(np.array(size) / cell).astype(int)
     grid = np.stack(np.meshgrid(*[np.arange(n + 1) for n in counts], indexing="ij"), axis=-1)
     nodes = (grid * cell - [size[0] / 2, size[1] / 2, 0.0]).reshape(-1, 3)
@@ -71,21 +72,21 @@ def column() -> TetMesh:
 
 
 def stool() -> TetMesh:
-    """Four legs under a seat."""
+    """Return four legs under a seat."""
     return carved(
         (0.7, 0.7, 0.8), 0.1, lambda c: (c[:, 2] > 0.6) | ((np.abs(c[:, 0]) > 0.15) & (np.abs(c[:, 1]) > 0.15))
     )
 
 
 def coarse_stool() -> TetMesh:
-    """Four legs of one cell each, under a seat: 152 nodes."""
+    """Return four legs, each one cell wide, under a seat; the mesh has 152 nodes."""
     return carved(
         (0.75, 0.75, 0.9), 0.15, lambda c: (c[:, 2] > 0.75) | ((np.abs(c[:, 0]) > 0.2) & (np.abs(c[:, 1]) > 0.2))
     )
 
 
 def figure() -> TetMesh:
-    """Two legs, a trunk that ends in a head, two extended arms."""
+    """Return a figure with two legs, a trunk that ends in a head, and two extended arms."""
 
     def keep(c: np.ndarray) -> np.ndarray:
         x, z = np.abs(c[:, 0]), c[:, 2]
@@ -98,7 +99,7 @@ def figure() -> TetMesh:
 
 
 def ball_mesh(cells: int = 4) -> TetMesh:
-    """A ball of diameter 1 on z = 0: a cube of ``cells`` cells along each side, mapped smoothly to a ball."""
+    """Return a ball of diameter 1 on z = 0: a cube of ``cells`` cells along each side, mapped smoothly to a ball."""
     cube = box_mesh((cells, cells, cells), (2.0, 2.0, 2.0))
     x, y, z = (cube.nodes - [0.0, 0.0, 1.0]).T
     squares = x * x, y * y, z * z
@@ -115,5 +116,5 @@ def ball_mesh(cells: int = 4) -> TetMesh:
 
 
 def worm_mesh(cells: int = 14) -> TetMesh:
-    """A bar on z = 0, 1 high and wide, along x, more than three times as long."""
+    """Return a bar along x on z = 0, 1 m high and wide, and more than three times as long."""
     return box_mesh((cells, 2, 2), (0.5 * cells, 1.0, 1.0))

@@ -25,11 +25,12 @@ _ORDER = frozenset(["Eq", "NotEq", "Lt", "LtE", "Gt", "GtE"])
 _IDENTITY = frozenset(["Is", "IsNot"])
 _SIGNS = frozenset(["USub", "UAdd"])
 _FAMILIES = (_ARITHMETIC, _BITS, _ORDER, _IDENTITY, _SIGNS)
-"""An operator is replaced by one of its family: a shift of floats would raise a TypeError, which shows nothing."""
+"""Families of operators. An operator is only replaced by one of its family: a shift of floats, for example, would raise
+a TypeError, which does not test the tests."""
 _NO_KERNEL = frozenset(["RemoveDecorator", "ZeroIterationForLoop", "ExceptionReplacer"])
-"""Operators that produce code that Warp does not compile."""
+"""Operators of cosmic-ray whose changes Warp cannot compile."""
 _GUARDS = ("strict=True", "frozen=True", '"enable_backward": False')
-"""Options that change no result of a correct program."""
+"""Options that do not change the results of a correct program; they are not mutated."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change."""
+    """A change of one line of a file."""
 
     package: str
     file: str
@@ -114,7 +115,8 @@ def sample(package: str, count: int, seed: int) -> list[Mutant]:
 
 
 def tests_of(package: str, file: str) -> list[str]:
-    """Return the package's test files by import distance to the changed module, the file named after it first."""
+    """Return the package's test files, sorted by import distance to the changed module; the file named after it is
+    first."""
     module = file.removesuffix(".py").replace("/", ".")
     own = f"test_{Path(file).stem}"
     tests = (ROOT / "tests" / package).glob("test_*.py")
@@ -192,7 +194,7 @@ def _annotations(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
 
 @cache
 def _operators() -> list[tuple[str, Any]]:
-    """Return the operators of cosmic-ray that need no arguments and stay within a family."""
+    """Return name and class of the operators of cosmic-ray that need no arguments and stay within a family."""
     provider = importlib.import_module("cosmic_ray.operators.provider").OperatorProvider()
     return [(name, provider[name]()) for name in provider if not provider[name].arguments() and _stays(name)]
 

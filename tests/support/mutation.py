@@ -35,9 +35,9 @@ _FAST = "not (slow or data or example or cuda)"
 _MIN_KILLED = 0.8
 """Minimum fraction of a package's mutants that are killed, not counting survivors that reveal no gap in the tests."""
 _TIME_FACTOR = 4.0
-"""Time limit as a factor of the duration of the package's tests; a mutant that takes longer is killed by time."""
+"""Time limit as a multiple of the duration of the package's tests; a mutant that takes longer counts as killed."""
 _HEAD_START = 60.0
-"""Additional time, s, for kernels that are recompiled."""
+"""Additional time for the compilation of changed kernels, s."""
 _KINDS = ("assertion", "exception", "time", "survived")
 
 
@@ -46,14 +46,14 @@ class Outcome:
     """Result of one mutant."""
 
     kind: str
-    """Reason for which a test failed, ``assertion``, ``exception`` or ``time`` (limit), or ``survived``."""
+    """The reason of the failure, ``assertion``, ``exception`` or ``time`` (limit), or ``survived``."""
     seconds: float
     test: str
     """The test that failed."""
 
 
 class Session:
-    """The results so far: lines of JSON, one per mutant, and the durations of the packages' unchanged tests."""
+    """Results of finished mutants, one line of JSON each, and durations of the tests of unchanged packages."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -132,7 +132,7 @@ class Copy:
             shutil.copy2(ROOT / mutant.file, place)
 
     def keep_kernels(self, kernels: Path) -> None:
-        """Copy the kernels that were compiled here, for other copies."""
+        """Copy the kernels that were compiled in this copy to the folder ``kernels``, for other copies."""
         shutil.copytree(self._kernels, kernels, dirs_exist_ok=True)
 
     def _environment(self) -> dict[str, str]:
@@ -144,7 +144,7 @@ class Copy:
 
 
 def main() -> int:
-    """Run the mutation tests; returns 1 if too few mutants are killed, or if the tests fail on the unchanged code."""
+    """Run the mutation tests; return 1 if too few mutants are killed, or if the tests fail on the unchanged code."""
     chosen = _arguments()
     began = time.monotonic()
     session = Session(chosen.session)
@@ -193,7 +193,8 @@ def _is_open(mutant: Mutant, session: Session, repeat_survivors: bool) -> bool:
 
 
 def _baselines(chosen: argparse.Namespace, session: Session, place: Path) -> bool:
-    """Run each package's tests on the unchanged code; record their duration and kernels. Returns False if one fails."""
+    """Run the tests of each package on the unchanged code, and record their duration and kernels. Return False if a
+    test fails."""
     state = _digest(ROOT.joinpath(name) for name in ("egs_warp", "tests"))
     kernels = OUT / "kernels"
     packages = [

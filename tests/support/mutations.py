@@ -1,6 +1,6 @@
 """Deliberately wrong formulas, each with the test that must fail; ``tests/test_formula_mutations.py`` runs them.
 
-When a formula of the package is rewritten, its line here must be rewritten too.
+When a formula of the package is rewritten, its line in this file must be rewritten, too.
 """
 
 from __future__ import annotations
@@ -388,6 +388,6 @@ OTHER_FORMULAS: list[Mutation] = [
         ),
     ]
 ]
-"""Mutations of formulas that the paper leaves open."""
+"""Mutations of formulas that are not in the paper."""
 
 ALL = [*EQUATIONS.values(), *OTHER_FORMULAS]

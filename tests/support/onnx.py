@@ -18,7 +18,7 @@ def node(operation: str, inputs: Sequence[str], outputs: Sequence[str]) -> bytes
 
 
 def tensor(name: str, shape: Sequence[int], values: Sequence[float], *, external: str | None = None) -> bytes:
-    """Return a constant, stored here or in the file ``external``."""
+    """Return a constant, stored in the message itself or in the file ``external``."""
     numbers = _field(9, struct.pack(f"<{len(values)}f", *values))
     if external is not None:
         numbers = _field(13, _field(1, "location") + _field(2, external)) + _field(14, 1)

@@ -1,4 +1,4 @@
-"""Requirements on the controls of a page: label, tooltip, place in the window and visible focus."""
+"""Requirements on the controls of a page: label, tooltip, position within the window, and visible focus."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ _FOCUS = """() => {
 
 
 def check_controls(page: Any, width: int) -> int:
-    """Check labels, tooltips and places of all controls in a window of ``width`` pixels; return their number."""
+    """Assert that all controls have labels and tooltips and are within a window of ``width`` pixels; return their
+    number."""
     controls = page.evaluate(_CONTROLS)
     assert [one["control"] for one in controls if not one["label"]] == []
     assert [one["control"] for one in controls if not one["tooltip"]] == []
@@ -42,7 +43,7 @@ def check_controls(page: Any, width: int) -> int:
 
 
 def check_focus(page: Any, count: int) -> None:
-    """Check that ``count`` presses of the tab key reach different controls whose focus is visible."""
+    """Assert that ``count`` presses of the tab key reach as many different controls with a visible focus."""
     seen = []
     for _ in range(count):
         page.keyboard.press("Tab")
@@ -53,7 +54,7 @@ def check_focus(page: Any, count: int) -> None:
 
 
 def contrast(page: Any, text: str, pane: str) -> float:
-    """Return the contrast ratio (WCAG) of two elements: the colour of one and the background of the other."""
+    """Return the contrast ratio (WCAG) of the text colour of one element and the background colour of another."""
     colours = page.evaluate(
         """([text, pane]) => {
             const style = (selector) => getComputedStyle(document.querySelector(selector));

@@ -13,7 +13,7 @@ from egs_warp.web.server import FrameFeed, PageServer
 
 
 class RecordedFeed:
-    """A recording sent frame by frame in a loop."""
+    """Feed that sends the frames of a recording in a loop."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -39,7 +39,7 @@ class RecordedFeed:
 
 @contextmanager
 def served(*runs: Recording, feed: FrameFeed | None = None, **place: Any) -> Iterator[PageServer]:
-    """Run a server within the block; ``place`` has its port and token."""
+    """Run a server within the block; ``place`` may contain its port and token."""
     server = PageServer([run.bytes for run in runs], feed=feed, **place)
     thread = threading.Thread(target=server.serve)
     thread.start()

@@ -1,4 +1,4 @@
-"""A body without muscle control, stepped as in the engine: contact detection, then forces and velocities."""
+"""A body without muscle control, stepped like in the engine: contact selection, then the coupled solve."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.muscles.tension import MuscleEnergy
 
 ABYSS = Plane(np.array([0.0, 0.0, 1.0]), 1e9)
-"""A ground far below every body."""
+"""Ground plane far below every body."""
 
 
 @dataclass
@@ -64,7 +64,7 @@ def passive_body(
 ) -> PassiveBody:
     """Place ``body`` over ``plane``, at rest unless ``state`` is given.
 
-    Contact points are at ``places`` (P, 3) on its rest shape; by default there is a single one at its middle, for a
+    Contact points are at ``places`` (P, 3), m, in its rest shape; by default there is a single one at its middle, for a
     body in flight.
     """
     nodes = body.mesh.nodes
@@ -84,6 +84,6 @@ def passive_body(
 
 
 def base_places(body: SoftBody, count: int = 5) -> np.ndarray:
-    """(count^2, 3) grid under a box that stands on z = 0."""
+    """Return a grid (count^2, 3), m, of points on the base of a box that stands on z = 0."""
     (x, y, _), (left, front, _) = body.mesh.nodes.max(axis=0), body.mesh.nodes.min(axis=0)
     return np.array([[a, b, 0.0] for a in np.linspace(left, x, count) for b in np.linspace(front, y, count)])

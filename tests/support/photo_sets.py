@@ -18,7 +18,7 @@ NAMES = ("00.jpg", "01.jpg", "02.jpg", "03.jpg")
 
 
 def cameras(count: int = len(NAMES)) -> list[Camera]:
-    """Cameras around the origin, with +z up."""
+    """Return cameras around the origin, with +z up."""
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     return [
         Camera(
@@ -45,7 +45,7 @@ def write_picture(path: Path, pixels: np.ndarray) -> None:
 
 
 def image_lines(names: Sequence[str] = NAMES) -> list[str]:
-    """First line of each image in COLMAP's ``images.txt``."""
+    """Return the first line of each image in COLMAP's ``images.txt``."""
     lines = []
     for number, (name, camera) in enumerate(zip(names, cameras(len(names)), strict=True), start=1):
         x, y, z, w = Rotation.from_matrix(camera.rotation).as_quat()
@@ -65,7 +65,7 @@ def write_colmap(folder: Path, names: Sequence[str] = NAMES, *, camera: str = CA
 
 
 def frames(names: Sequence[str] = NAMES) -> list[dict]:
-    """Frames of a ``transforms.json``."""
+    """Return the frames of a ``transforms.json``."""
     entries = []
     for name, camera in zip(names, cameras(len(names)), strict=True):
         matrix = np.eye(4)
@@ -83,7 +83,7 @@ def write_transforms(folder: Path, entries: list[dict], **shared: object) -> Non
 
 
 def silhouettes(count: int = len(NAMES)) -> list[np.ndarray]:
-    """(H, W) uint8, 255 where the camera sees a ball of radius 0.5 off the origin, else 0."""
+    """Return masks (H, W), uint8, of a ball of radius 0.5 away from the origin: 255 inside its silhouette, else 0."""
     masks = []
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     for camera in cameras(count):

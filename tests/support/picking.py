@@ -17,7 +17,8 @@ from egs_warp.web.preview import camera_facts, page_frame, still_run
 
 
 class Commands:
-    """Commands that end at once: the film is that of ``folder``, and the live simulation finds no capture."""
+    """Commands that end at once: the film is the existing run in ``folder``, and the live simulation finds no
+    capture."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -39,7 +40,7 @@ class Commands:
 
 
 def picking(cloud: GaussianCloud, path: Path, commands: PickCommands | None = None) -> tuple[PickSession, PickFeed]:
-    """Return a session that is not started, and its feed; ``commands`` are those of ``PickSource``."""
+    """Return a session that is not started, and its feed; ``commands`` are passed to ``PickSource``."""
     frame, bounds = page_frame(cloud, up=np.array([0.0, 0.0, 1.0]))
     placed = to_body_frame(cloud, frame)
     session = PickSession(PickSource(cloud, placed, frame, "scene.ply", path, commands or Commands(path.parent)))
@@ -48,7 +49,7 @@ def picking(cloud: GaussianCloud, path: Path, commands: PickCommands | None = No
 
 
 def events_until(session: PickSession, done: Callable[[dict[str, dict[str, Any]]], bool]) -> dict[str, dict[str, Any]]:
-    """Return the latest event of each type once ``done`` holds for them."""
+    """Return the latest event of each type as soon as ``done`` is true for them."""
     latest: dict[str, dict[str, Any]] = {}
     end = time.monotonic() + 120.0
     while time.monotonic() < end:

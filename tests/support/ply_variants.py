@@ -1,4 +1,4 @@
-"""Files of Gaussians in .ply as other tools write them, column by column."""
+"""Files of Gaussians in .ply in the layouts of other tools, built column by column."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def ply_of(
     layout: str = "binary_little_endian",
     newline: str = "\n",
 ) -> bytes:
-    """Return a .ply with one element ``vertex``; ``kinds`` are NumPy's types of all columns, or of some."""
+    """Return a .ply with one element ``vertex``; ``kinds`` are the NumPy types of all columns, or of some by name."""
     order = ">" if layout == "binary_big_endian" else "<"
     kind = {name: kinds if isinstance(kinds, str) else kinds.get(name, "f4") for name in columns}
     count = len(next(iter(columns.values())))

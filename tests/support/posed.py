@@ -1,4 +1,4 @@
-"""Photos with poses."""
+"""A small set of photos with poses."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ _FAILING = re.compile(r"^(?:Failing test case|Falsifying example): \w+\(\n(.*?)^
 
 
 def examples(count: int) -> int:
-    """Return ``count``, the number of examples in ``make test``, or ten times as many under ``make fuzz``."""
+    """Return the number of examples: ``count`` in ``make test``, ten times as many in ``make fuzz``."""
     return _FUZZ_FACTOR * count if FUZZING else count
 
 

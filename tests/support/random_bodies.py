@@ -19,7 +19,7 @@ FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 
 @dataclass(frozen=True)
 class Shape:
-    """A block of any size and material with a flat base on z = 0, wider or narrower at its top, with jittered nodes."""
+    """A block with a flat base on z = 0, a wider or narrower top, and perturbed nodes, and its material."""
 
     counts: tuple[int, int, int]
     """Number of nodes along x, y and z."""
@@ -33,7 +33,7 @@ class Shape:
     seed: int
 
     def mesh(self) -> TetMesh:
-        """Return the mesh, which has no mirror plane."""
+        """Return the mesh, which has no mirror symmetry."""
         block = block_mesh(*self.counts, self.size)
         nodes = block.nodes.copy()
         high = nodes[:, 2] > 0.0
@@ -52,7 +52,8 @@ class Shape:
 
 
 def shapes(*, stiff: bool = False) -> st.SearchStrategy[Shape]:
-    """Blocks of 8 to 36 nodes, half to three times as high as wide; ``stiff`` ones do not tip over."""
+    """Return a strategy for blocks of 8 to 36 nodes, half to three times as high as wide. ``stiff`` blocks are flat, so
+    that they do not tip over."""
     side = st.floats(0.25, 0.5)
     return st.builds(
         Shape,
@@ -68,7 +69,7 @@ def shapes(*, stiff: bool = False) -> st.SearchStrategy[Shape]:
 
 @dataclass(frozen=True)
 class Throw:
-    """A pose and a motion: rotation, strain, jitter of the nodes, velocity and angular velocity."""
+    """A pose and a motion: rotation, strain, random displacements of the nodes, velocity and angular velocity."""
 
     turn: tuple[float, float, float]
     """Rotation vector, rad."""
@@ -76,7 +77,7 @@ class Throw:
     velocity: tuple[float, float, float]
     """Velocity in units of sqrt(g H)."""
     spin: tuple[float, float, float]
-    """Angular velocity, rad/s times sqrt(H / g)."""
+    """Angular velocity in units of sqrt(g / H)."""
     noise: float
     seed: int
 
@@ -94,7 +95,8 @@ class Throw:
 
 
 def throws(*, turn: float = 3.0, fastest: float = 0.5) -> st.SearchStrategy[Throw]:
-    """Velocities up to ``fastest`` sqrt(g H) in each direction, rotations up to ``turn`` rad about each axis."""
+    """Return a strategy for throws with velocities up to ``fastest`` sqrt(g H) in each direction and rotations up to
+    ``turn`` rad about each axis."""
 
     def three(limit: float) -> st.SearchStrategy[tuple[float, float, float]]:
         return st.tuples(*[st.floats(-limit, limit)] * 3)

@@ -1,4 +1,4 @@
-"""Every reader of external files, with valid files to start from and the requirements on what is read.
+"""Every reader of external files, with a valid file and the requirements on the content that is read.
 
 ``tests/support/corruption.py`` derives inputs from them.
 """
@@ -66,7 +66,7 @@ MAX_SECONDS = 2.0
 
 @dataclass(frozen=True)
 class Reader:
-    """One kind of file."""
+    """A reader of one kind of file, with a valid file."""
 
     name: str
     file: str
@@ -89,7 +89,7 @@ class BrokenPromiseError(AssertionError):
 def outcome(reader: Reader, folder: Path, data: bytes) -> str:
     """Read a file; return ``valid`` or ``refused``, or raise ``BrokenPromiseError``.
 
-    A slow reading is repeated, and only the second time counts, because the machine may have paused during the first.
+    A slow read is repeated, and only the second time counts, because the machine may have paused during the first.
     """
     path = folder / reader.file
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -115,7 +115,8 @@ class _Reading:
 
     @property
     def slow(self) -> bool:
-        """True if it took too long by CPU time, since the machine may be busy; by wall-clock time, as it may block."""
+        """True if the read took too long: by CPU time, because the machine may be busy, or by a longer wall-clock time,
+        because the read may block."""
         return self.work > MAX_SECONDS or self.took > 10.0 * MAX_SECONDS
 
     def __str__(self) -> str:
@@ -146,7 +147,7 @@ def prepare(reader: Reader, folder: Path) -> None:
         (folder / name).write_bytes(data)
 
 
-# What is read must be usable --------------------------------------------------------------------------------------
+# Requirements on the content --------------------------------------------------------------------------------------
 
 
 def _capture(path: Path) -> None:
@@ -177,7 +178,7 @@ def _cameras(path: Path) -> list[PosedImage]:
 
 
 def _photos(path: Path) -> None:
-    """Read the cameras, and their photos, undistorted."""
+    """Read the cameras and their undistorted photos."""
     for one in _cameras(path):
         if one.image is not None:
             photo = read_photo(one, max_side=20)
@@ -344,7 +345,7 @@ _LENSES = {
     "RAD_TAN_THIN_PRISM_FISHEYE": "30 30 12 8 0.1 0 0 0 0 0 0.01 0 0 0.01 0 0",
     "FULL_OPENCV": "30 30 12 8 0.1 0 0.01 0 0 0.2 0 0",
 }
-"""Lenses of COLMAP with their numbers; no photo uses the first one."""
+"""COLMAP's camera models with lenses, and their parameters; no photo uses the first one."""
 _REALITY_SCAN = (
     b"#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
     b"a.png,1.5,-2,0.25,30,85,-1,35,0.001,-0.002,0.1,0,0,0,0.01,0\n"
@@ -422,7 +423,7 @@ def _gltf_of(data: bytes) -> bytes:
 
 
 def _packed_glb() -> bytes:
-    """Return a .glb with a .spz inside, under two nodes, the second mirrored, with two instances."""
+    """Return a .glb that contains a .spz, shown by two nodes; the second one is mirrored and has two instances."""
     data = _glb()
     size = int.from_bytes(data[12:16], "little")
     tree = json.loads(data[20 : 20 + size])
@@ -447,7 +448,7 @@ def _packed_glb() -> bytes:
 
 
 def _quantized_gltf() -> bytes:
-    """Return a .gltf of integers with a matrix, two nodes of one mesh, and another scene."""
+    """Return a .gltf with integer attributes, a node with a matrix, two nodes of one mesh, and a second scene."""
     tree = json.loads(_gltf())
     whole = np.round(np.clip(small_cloud().means.numpy(), -3.0, 3.0) * 1000.0).astype("<i2")
     turns = np.round(small_cloud().rotations.numpy()[:, [1, 2, 3, 0]] * 32767.0).astype("<i2")
@@ -471,7 +472,7 @@ def _packed_gltf() -> bytes:
 
 
 def _ply_variant() -> bytes:
-    """Return a .ply of halves, flat, with byte colours, in big-endian order, with tags."""
+    """Return a big-endian .ply of flat Gaussians in half precision, with colours in bytes, and header tags."""
     columns = without(columns_of(small_cloud()), "scale_2", "f_")
     colours = dict.fromkeys(("red", "green", "blue"), np.arange(small_cloud().count))
     return ply_of(
@@ -483,7 +484,7 @@ def _ply_variant() -> bytes:
 
 
 def _georeferenced_ply() -> bytes:
-    """Return a .ply of doubles far from its origin, with the comments of Postshot and Brush."""
+    """Return a .ply with positions in double precision far from the origin, and the comments of Postshot and Brush."""
     columns = columns_of(small_cloud())
     places = zip("xyz", (431000.0, 5403000.0, 120.0), strict=True)
     columns |= {name: columns[name].astype(float) + place for name, place in places}
@@ -492,7 +493,7 @@ def _georeferenced_ply() -> bytes:
 
 
 def _activated_ply() -> bytes:
-    """Return a text .ply of activated values and of degree 4."""
+    """Return a text .ply with activated scales and opacities, and SH of degree 4."""
     cloud = concatenate(*[small_cloud()] * 3)
     columns = without(columns_of(cloud), "f_rest")
     columns |= {name: np.exp(values) for name, values in columns.items() if name.startswith("scale")}
@@ -506,7 +507,7 @@ def _spz_of_streams() -> bytes:
 
 @cache
 def _record() -> dict[str, bytes]:
-    """Files of a recorder after eight steps."""
+    """Return the files of a recorder after eight steps, by name."""
     slid = slide()
     with tempfile.TemporaryDirectory() as folder:
         recorder = slid.recorder(folder=lambda: Path(folder))
@@ -546,7 +547,7 @@ _MESSAGES = [
 
 
 def _messages(path: Path) -> None:
-    """Read messages like the server of ``live``: invalid ones give a one-line error."""
+    """Read messages in the way of the server of ``live``; an invalid one gives a one-line error."""
     try:
         tree = json.loads(path.read_bytes())
         for message in tree if isinstance(tree, list) else [tree]:

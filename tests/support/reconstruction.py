@@ -1,4 +1,4 @@
-"""Photos, and a substitute for pycolmap, which estimates camera poses."""
+"""Photos, and a substitute for pycolmap's estimation of camera poses."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ COLMAP_BIN = {
     "images.bin": struct.pack("<Qi7di", 1, 1, 1, 0, 0, 0, 0, 0, 2, 1) + b"a.png\0" + _OBSERVATION,
     "points3D.bin": struct.pack("<QQ3d3Bd", 1, 1, 0.5, 0.5, 2.0, 255, 128, 0, 0.3) + struct.pack("<Q2i", 1, 1, 0),
 }
-"""Files of a binary COLMAP model by name: one photo, ``a.png``, two points."""
+"""Files of a binary COLMAP model with one photo, ``a.png``, and two points, by name."""
 
 
 def photos_of_noise(folder: Path) -> Path:
-    """Write three photos of 64 by 48 pixels, each a few kilobytes large."""
+    """Write three photos of 64 x 48 pixels, of a few kilobytes each."""
     folder.mkdir()
     random = np.random.default_rng(0)
     for number in range(3):
@@ -31,7 +31,8 @@ def photos_of_noise(folder: Path) -> Path:
 
 
 def model(*_: object, capacity: int | None = None, **__: object) -> SimpleNamespace:
-    """Substitute for COLMAP's reconstruction; each file is truncated to ``capacity`` bytes, as on a full disk."""
+    """Return a substitute for COLMAP's reconstruction, which truncates each file to ``capacity`` bytes, as on a full
+    disk."""
 
     def write_binary(folder: str) -> None:
         for name, data in COLMAP_BIN.items():
@@ -46,6 +47,6 @@ def model(*_: object, capacity: int | None = None, **__: object) -> SimpleNamesp
 
 
 def reconstruct_by(patch: pytest.MonkeyPatch, reconstructed: Callable[..., object]) -> None:
-    """Let ``pose`` call ``reconstructed`` in place of pycolmap."""
+    """Make the command ``pose`` call ``reconstructed`` in place of pycolmap."""
     patch.setitem(sys.modules, "pycolmap", ModuleType("pycolmap"))
     patch.setattr("egs_warp.pipelines.pose_photos._reconstructed", reconstructed)

@@ -14,7 +14,7 @@ from egs_warp.muscles.tension import MuscleEnergy
 
 @dataclass(frozen=True)
 class ReferenceIterate:
-    """Velocities (N, 3) m/s and contact forces (n, 3) N; the residual there, and the Newton step from there."""
+    """Newton iterate: velocities (N, 3), m/s, and contact forces (n, 3), N, with its residual and its Newton step."""
 
     linearization: ContactLinearization
     tension: MuscleEnergy | None
@@ -35,7 +35,7 @@ class ReferenceIterate:
 
     @property
     def residual_norm(self) -> float:
-        """Norm of the residual with contact forces, divided by dt x weight; not finite where an element is inverted."""
+        """Norm of the residual with contact forces, divided by dt x weight; not finite if an element is inverted."""
         return float(np.linalg.norm(self.residual)) / self.linearization.tangent.problem.residual_scale
 
     @property
@@ -45,7 +45,7 @@ class ReferenceIterate:
 
     @cached_property
     def free_velocities(self) -> np.ndarray:
-        """(3N,) m/s after a Newton step without contact forces."""
+        """(3N,) m/s, velocities after a Newton step without contact forces."""
         return self.velocities.ravel() - self.linearization.tangent.solve(self.free_residual.ravel())
 
     @property
@@ -55,7 +55,7 @@ class ReferenceIterate:
 
     @property
     def velocities_with_fixed_forces(self) -> np.ndarray:
-        """(N, 3) m/s after a Newton step with the same contact forces."""
+        """(N, 3) m/s, velocities after a Newton step with the same contact forces."""
         return self.velocities - self.linearization.tangent.solve(self.residual).reshape(self.velocities.shape)
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:

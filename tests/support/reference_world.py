@@ -1,5 +1,5 @@
-"""A slow, obvious step of several bodies with contact between them: dense matrices, a new tangent in each iteration,
-and no line search.
+"""Slow reference for a step of several bodies with contact between them: dense matrices, a new tangent in each
+iteration, and no line search.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ TOLERANCE = 1e-9
 """Residual of the equations of motion at which a step ends, N s."""
 
 COULOMB_TOLERANCE = 1e-5
-"""Maximum violation of Coulomb's law in a step, m/s. Two flat faces have up to 24 contacts, more than the 12 unknowns
-of a prop can tell apart.
+"""Maximum violation of Coulomb's law in a step, m/s. It is not smaller because two flat faces have up to 24 contacts,
+and the 12 unknowns of a prop do not determine their forces uniquely.
 """
 
 
@@ -67,7 +67,7 @@ class ReferenceWorld:
             gaps.append(contacts.gaps)
         jacobian, gap = np.concatenate(rows), np.concatenate(gaps)
         height = min(body.height for body in self.bodies)
-        # The normal measure without the velocity (docs/concepts/contact.md): deep points are pushed out slowly.
+        # The normal bias (docs/concepts/contact.md): deep points are pushed out slowly.
         push_out = np.maximum(0.2 * np.minimum(gap + 5e-3 * height, 0.0) / dt, -0.05 * np.sqrt(9.81 * height))
         bias = np.maximum(gap, 0.0) / dt + push_out
         velocities, forces = [problem.rigid_guess for problem in problems], np.zeros((len(bias), 3))

@@ -8,7 +8,7 @@ from egs_warp.geometry.camera import Camera
 
 
 def rotation_matrices(q: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) rotations of the quaternions (n, 4) w, x, y, z, normalised first."""
+    """Return the rotation matrices (n, 3, 3) of quaternions (n, 4) w, x, y, z, which are normalised first."""
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
     return np.stack(
         [
@@ -21,7 +21,7 @@ def rotation_matrices(q: np.ndarray) -> np.ndarray:
 
 
 def sh_basis(d: np.ndarray) -> np.ndarray:
-    """(n, 16) real spherical harmonics of the unit directions (n, 3), with the signs of the INRIA code."""
+    """Return the real spherical harmonics (n, 16) of the unit directions (n, 3), with the signs of the INRIA code."""
     x, y, z = d.T
     root = np.sqrt
     pi = np.pi
@@ -58,7 +58,7 @@ def render_twin(
     """Render the Gaussians in ``values`` (the cloud's fields).
 
     Returns:
-        colour (H, W, 3), alpha, expected and median depth, and normal.
+        Colour (H, W, 3), alpha, expected and median depth (H, W), and normal (H, W, 3), by name.
     """
     m, q, log_scales, logits, sh = (
         np.asarray(values[k], dtype=np.float64) for k in ("means", "rotations", "log_scales", "opacity_logits", "sh")

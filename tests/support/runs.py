@@ -1,4 +1,4 @@
-"""A script simulated on a coarse block."""
+"""Simulation of a script with a coarse block."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Run:
 
 
 def coarse_block_run(script: str, field: HeightField | None = None) -> Run:
-    """Simulate ``script`` on a block of 45 nodes, 0.5 x 0.5 x 1 m, with the whole stepper, for a few hundred steps.
+    """Simulate ``script`` with a block of 45 nodes, 0.5 x 0.5 x 1 m, for a few hundred steps of the full stepper.
 
     ``field`` replaces the floor.
     """

@@ -70,12 +70,12 @@ def round_ones(means: np.ndarray, radius: float, bands: int = 1) -> GaussianClou
 
 
 def lying(means: np.ndarray) -> GaussianCloud:
-    """Return flat opaque Gaussians at ``means`` (n, 3), like those of a floor."""
+    """Return flat, horizontal, opaque Gaussians at ``means`` (n, 3), as on a floor."""
     return sheet(means, np.tile(FLOOR.normal, (len(means), 1)), 0.03, (0.5, 0.5, 0.5))
 
 
 def shell(count: int = 1500) -> np.ndarray:
-    """(n, 3) points of a Fibonacci lattice on a sphere of diameter 1 that touches the floor at the origin."""
+    """Return points (n, 3) of a Fibonacci lattice on a sphere of diameter 1 that touches the floor at the origin."""
     z = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
     angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count)
     around = np.sqrt(1.0 - z**2)

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def slab_matrix(parts: Sequence[int], between: int, *, seed: int) -> np.ndarray:
-    """(n, n) random positive definite matrix with independent diagonal blocks of ``parts`` unknowns.
+    """Return a random positive definite matrix (n, n) with independent diagonal blocks of ``parts`` unknowns.
 
     The blocks are coupled only by the last ``between`` unknowns.
     """

@@ -1,4 +1,5 @@
-"""A thrown coarse block that lands, slides and rotates under muscle work: all terms of an energy balance occur."""
+"""A coarse block that is thrown, lands, slides and rotates under muscle work, so that all terms of the energy balance
+occur."""
 
 from __future__ import annotations
 
@@ -27,10 +28,10 @@ class Slide:
     start: BodyState
     reports: tuple[StepReport, ...]
     kicks: tuple[np.ndarray | None, ...]
-    """(N, 3) m/s, velocity change of the nodes from outside at the start of each step."""
+    """(N, 3) m/s, external velocity change of the nodes at the start of each step, or None."""
 
     def recorder(self, **options: Any) -> Recorder:
-        """Return a recorder without any steps yet."""
+        """Return a recorder of this body without steps."""
         stepper = self.stepper
         gaps, _ = stepper.detector.gaps(self.start.positions)
         drag = stepper.settings.drag
@@ -48,7 +49,8 @@ class Slide:
 
 @cache
 def slide(*, struck: bool = False) -> Slide:
-    """Simulate 24 steps with drag; with ``struck``, a blow hits one side in the ninth step, then wind blows."""
+    """Simulate 24 steps with drag; with ``struck``, a blow hits one side in the ninth step, and wind blows from then
+    on."""
     creature = coarse_creature(block_mesh(), forward=FORWARD)
     body, muscles, geometry = creature.stepper.body, creature.stepper.muscles, creature.stepper.geometry
     stepper = LocomotionStepper(body, muscles, geometry, settings=LocomotionSettings(drag=0.3), device="cpu")

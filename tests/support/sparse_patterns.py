@@ -7,14 +7,15 @@ import scipy.sparse as sparse
 
 
 def upper_of(matrix: sparse.csc_matrix) -> sparse.csc_matrix:
-    """Return the upper triangle, sorted."""
+    """Return the upper triangle with sorted indices."""
     upper = sparse.csc_matrix(sparse.triu(matrix))
     upper.sort_indices()
     return upper
 
 
 def dominant(pattern: np.ndarray, seed: int = 0) -> sparse.csc_matrix:
-    """Return random numbers where ``pattern`` (n, n) is set, in either triangle, and a dominant diagonal."""
+    """Return a symmetric matrix with random entries where ``pattern`` (n, n), or its transpose, is set, and a dominant
+    diagonal."""
     either = np.triu(pattern | pattern.T, 1)
     values = np.where(either, np.random.default_rng(seed).standard_normal(either.shape), 0.0)
     values += values.T
@@ -23,7 +24,7 @@ def dominant(pattern: np.ndarray, seed: int = 0) -> sparse.csc_matrix:
 
 def _grid(nx: int, ny: int, nz: int) -> np.ndarray:
     places = np.stack(np.meshgrid(*map(np.arange, (nx, ny, nz)), indexing="ij"), axis=-1).reshape(-1, 3)
-    # A mesher numbers nodes in no particular order.
+    # Random order, because meshers number nodes in no particular order.
     places = np.random.default_rng(8).permutation(places)
     near = np.abs(places[:, None] - places).max(axis=-1) <= 1
     return np.kron(near, np.ones((3, 3), dtype=bool))

@@ -1,4 +1,4 @@
-"""A block that stands at the start of a motion, and the same block posed by hand."""
+"""Stances of bodies at the start of a motion, and displaced nodes of a standing body."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DT = 1 / 60
 
 
 def block_place(mesh: TetMesh | None = None) -> Stance:
-    """Return a block of 0.4 x 0.4 x 1 m, irregular inside, or another ``mesh`` that stands on z = 0 and faces +x."""
+    """Return the stance of a block of 0.4 x 0.4 x 1 m, or of another ``mesh``, that stands on z = 0 and faces +x."""
     mesh = mesh or block_mesh()
     body = make_body(mesh, FLOOR, device="cpu")
     standing = mesh.nodes - [0.0, 0.0, mesh.nodes[:, 2].min()]
@@ -34,6 +34,7 @@ def standing_stance(mesh: TetMesh) -> Stance:
 
 
 def moved(place: Stance, angle: float, shift: np.ndarray) -> np.ndarray:
-    """(N, 3) nodes of the standing block, rotated by ``angle`` rad about up and translated by ``shift`` (3,)."""
+    """Return the nodes (N, 3) of the standing body, rotated by ``angle`` rad about the up axis and translated by
+    ``shift`` (3,), m."""
     com = place.body.centre_of_mass(place.standing)
     return com + (place.standing - com) @ place.ground.rotation_about_up(angle).T + shift

@@ -17,7 +17,7 @@ class _Handler(SimpleHTTPRequestHandler):
 
 @contextmanager
 def served_folder(folder: Path) -> Iterator[str]:
-    """Serve ``folder`` within the block; yields its address."""
+    """Serve ``folder`` within the block; yield its address."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Handler, directory=str(folder)))
     thread = threading.Thread(target=server.serve_forever)
     thread.start()

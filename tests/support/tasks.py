@@ -1,4 +1,4 @@
-"""Tasks for processes that may die."""
+"""Tasks for worker processes that may be killed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from egs_warp.pipelines.worker_pool import ProgressCallback
 
 
 def square(task: int, progress: ProgressCallback) -> int:
-    """Report progress and return the square; raises for 3 and 5, and returns something that cannot be sent for 4."""
+    """Report progress and return the square. Tasks 3 and 5 raise an error, and task 4 returns an object that cannot be
+    pickled."""
     progress(task, 2 * task)
     if task == 3:
         raise ArgumentError("task", "give another", value=3)
@@ -28,7 +29,7 @@ def square(task: int, progress: ProgressCallback) -> int:
 
 
 class Dying:
-    """Callable that kills its process as often as ``deaths`` says for a task, and records each start in a file."""
+    """Task that kills its process in the first ``deaths[task]`` attempts, and records each attempt in a file."""
 
     def __init__(self, folder: Path, deaths: dict[int, int]) -> None:
         self.folder, self.deaths = folder, deaths
@@ -42,7 +43,7 @@ class Dying:
 
 
 def threads(task: Any, progress: ProgressCallback) -> dict[str, Any]:
-    """Return the number of threads of a worker."""
+    """Return the numbers of threads that a worker uses."""
     import numpy
 
     # NumPy is imported only because it loads BLAS.
@@ -58,5 +59,5 @@ def sleeping(folder: str, progress: ProgressCallback) -> None:
 
 
 def half(whole: float, by: float) -> dict[str, float]:
-    """Return a benchmark's row."""
+    """Return a row of a benchmark: the quotient of the arguments."""
     return {"share": whole / by}

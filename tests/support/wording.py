@@ -118,12 +118,13 @@ def docstring_findings(path: str, tokens: list[tokenize.TokenInfo]) -> Iterator[
 
 
 def lines_of(text: str) -> str:
-    """Return only the line ends of a text, so that line numbers do not change."""
+    """Return the line breaks of a text without its other characters; replacing text by them keeps line numbers."""
     return "\n" * text.count("\n")
 
 
 def prose_of(path: str, source: str, tokens: list[tokenize.TokenInfo]) -> str:
-    """Return the prose of a file, each word on its line: comments and docstrings, or a page without its code."""
+    """Return the prose of a file, with each word on its original line: comments and docstrings, or a page without
+    code."""
     if path.endswith(".md"):
         return CODE.sub(lambda match: lines_of(match[0]), source)
     if path.endswith(".py"):

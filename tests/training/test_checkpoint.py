@@ -1,4 +1,4 @@
-"""An interrupted training continues to the bits of an uninterrupted one."""
+"""Checkpoints: an interrupted training that is resumed gives the bits of an uninterrupted one."""
 
 from __future__ import annotations
 
@@ -31,14 +31,15 @@ OPTIONS = FinetuneOptions(
     seed=3,
 )
 CUTS = (17, 104, 209)
-"""Steps before and after Gaussians are moved and added, and after a view is excluded."""
+"""Steps at which the training is interrupted: before and after Gaussians are moved and added, and after a view is
+excluded."""
 
 
 @pytest.fixture(autouse=True)
 def one_thread(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("egs_warp.training.checkpoint.SECONDS", 0.0)
     monkeypatch.setattr("egs_warp.training.checkpoint._SHARE", 1e9)
-    # One view in ten is excluded early, whichever it is.
+    # With this threshold, one of the ten views is excluded early.
     monkeypatch.setattr("egs_warp.training.outlier_views._TIMES_MEDIAN", 1.0)
     monkeypatch.setattr("egs_warp.training.outlier_views._SPREADS", 0.1)
     threads = torch.get_num_threads()
@@ -49,7 +50,7 @@ def one_thread(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture(scope="module")
 def views() -> list[TrainingView]:
-    """Ten views of a ball."""
+    """Render ten views of a ball."""
     return render_views(GaussianCloud.from_numpy(**ball(60), device="cpu"), ring(10, 24))
 
 

@@ -1,4 +1,5 @@
-"""Different exposures are estimated, views that never fit are excluded, and growth ends when it has no benefit."""
+"""Training with real photos: exposures are estimated, outlier views are excluded, and growth ends when it has no
+benefit."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ from egs_warp.training.relocation import Population, _growth_factor  # noqa: E40
 
 @pytest.mark.slow
 def test_exposures_are_recovered_up_to_their_mean() -> None:
-    """Six views of one ball with gains from 0.7 to 1.2 and a warm or cold tint: the estimated differences between views
-    are those of the gains."""
+    """Six views of one ball have gains from 0.7 to 1.2 and a warm or cold tint. The estimated tones agree with the
+    gains up to their mean, and the loss is at least 40 % lower than without tones."""
     random = np.random.default_rng(0)
     cloud = GaussianCloud.from_numpy(**ball(), device="cpu")
     gains = np.linspace(0.7, 1.2, 6)[:, None] * (1 + 0.1 * random.uniform(-1, 1, (6, 3)))
@@ -77,8 +78,8 @@ def test_growth_ends_without_benefit_and_reaches_a_requested_cap() -> None:
 
 
 def test_regularization_and_jitter_equal_their_formulas() -> None:
-    """The regularisation is the derivative of the mean opacity and scale; the jitter of a faint Gaussian is Sigma times
-    noise."""
+    """The regularisation adds the derivatives of mean opacity and scale; the jitter of a faint Gaussian is proportional
+    to Sigma times a normal deviate."""
     count = 4000
     values = {
         "means": torch.zeros(count, 3),
@@ -111,7 +112,7 @@ def test_regularization_and_jitter_equal_their_formulas() -> None:
     )
     sigma = turn @ np.diag([0.09, 0.01, 0.0004]) @ turn.T
     gate = 1 / (1 + np.exp(100 * (1 / (1 + np.exp(9.0)) - 0.005)))
-    # 5e5 times the rate of the means, which is 1e-4 times the extent; covariances relative to the extent squared.
+    # 5e5 times the learning rate of the means, 1e-4 times the extent, divided by the squared extent for covariances.
     size = 5e5 * 2e-4 / 4.0 * gate
     moved = tensors["means"].detach().numpy().astype(float)
     np.testing.assert_allclose(np.cov(moved.T), size**2 * sigma @ sigma, atol=0.08 * (size * 0.09) ** 2)

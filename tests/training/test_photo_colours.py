@@ -1,4 +1,4 @@
-"""Photos of a scene, matched to the colours of its capture."""
+"""Photos of a scene are matched to the colours of its capture."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from tests.support.scenes import FLOOR, ball_on_floor
 
 
 def test_photos_of_the_cameras_clear_the_plane(tmp_path: Path) -> None:
-    """Eq. (21) with photos of the whole scene; a photo whose size differs from its camera's is refused."""
+    """Eq. (21): the loss decreases with photos of the whole scene as views. A photo whose size differs from its
+    camera's is refused."""
     pytest.importorskip("torch")
     from egs_warp.io import read_cameras
     from egs_warp.training.photo_colours import in_colours_of, photographs_in_colours_of
@@ -38,7 +39,7 @@ def test_photos_of_the_cameras_clear_the_plane(tmp_path: Path) -> None:
     assert photographs[0].image.shape == (96, 96, 3)
     expected = render_gaussians(cloud, posed[0].camera, background=(0.0, 0.0, 0.0)).colour.numpy()
     np.testing.assert_allclose(photographs[0].image, np.clip(expected, 0.0, 1.0), atol=1.0 / 255)
-    # Taken at a third of the exposure, in warmer light, and with another object in front.
+    # The photo has a third of the exposure, warmer light, and another object in front.
     expected = np.clip(expected, 0.0, 1.0)
     toned = expected * [0.4, 0.33, 0.25] + 0.02
     toned[70:80, 40:60] = 1.0
@@ -63,7 +64,8 @@ def test_photos_of_the_cameras_clear_the_plane(tmp_path: Path) -> None:
 
 
 def test_a_photo_is_reduced_in_blocks_of_whole_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A third of 97 pixels is 32, from the first 96; an image resized from all 97 would be shifted at its edge."""
+    """A photo of 97 pixels is reduced to a third from its first 96 pixels. Resizing all 97 would shift the image at its
+    edge."""
     pytest.importorskip("torch")
     from egs_warp.io import read_cameras
     from egs_warp.training import photo_colours

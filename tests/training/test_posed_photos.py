@@ -1,4 +1,4 @@
-"""Photos, masks and their origin as a training uses them."""
+"""Photos and masks that are read for a training, and the summary of their sources."""
 
 from __future__ import annotations
 
@@ -68,7 +68,8 @@ def test_invalid_poses_are_left_out_of_the_photos(tmp_path: Path) -> None:
 
 
 def test_opaque_alpha_channels(tmp_path: Path) -> None:
-    """Without a cut-out in any photo they have no information; if another photo has one, the object fills the photo."""
+    """If all alpha channels are opaque, they are ignored. If another photo has a cut-out, an opaque channel means that
+    the object fills the photo."""
     names = [name.replace(".jpg", ".png") for name in NAMES]
     write_transforms(tmp_path, frames(names))
     rgba = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
@@ -98,7 +99,7 @@ def test_a_mask_that_is_missing_is_reported(tmp_path: Path) -> None:
 
 
 def moving_blots() -> list[np.ndarray]:
-    """White masks with a black blot elsewhere in each, as of people that walk by."""
+    """Return white masks, each with a black blot at another position, as for people who walk by."""
     masks = []
     for number in range(8):
         mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
@@ -129,7 +130,8 @@ def test_black_objects_are_found_on_sure_evidence(masks: list[np.ndarray], expec
 
 
 def test_masks_that_are_too_large_are_no_evidence(tmp_path: Path) -> None:
-    """They would be decoded before their photo refuses them."""
+    """Masks that are too large are not decoded to find the colour of the object; they are refused later, with their
+    photo."""
     for factor, expected in ((10, True), (20, False)):
         folder = photo_set(
             tmp_path / str(factor), [np.kron(255 - m, np.ones((factor,) * 2, np.uint8)) for m in silhouettes(8)]

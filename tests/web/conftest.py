@@ -1,4 +1,4 @@
-"""A live session for each test of the page."""
+"""Fixture of the page tests: a live session."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.support.live_sessions import coarse_pawn, session_of
 
 @pytest.fixture
 def session(tmp_path: Path) -> Iterator[Session]:
-    """Session of a coarse pawn that runs in its thread."""
+    """Run a session of a coarse pawn in its thread."""
     made = session_of(coarse_pawn(), tmp_path)
     made.start()
     yield made

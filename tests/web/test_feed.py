@@ -1,4 +1,4 @@
-"""A session at the other end of a socket, and the command that serves one."""
+"""A live session behind a socket, and the command that serves it."""
 
 from __future__ import annotations
 

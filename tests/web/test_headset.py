@@ -1,4 +1,4 @@
-"""The pages in an emulated headset: real size, feet on the floor, pointing, and back to the page."""
+"""The pages in an emulated headset: real size, feet on the floor, pointing, and the return to the page."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _POINT = """([hand, x, y, z]) => {
     controller.position.set(from.x, from.y, from.z);
     controller.quaternion.set(cross[0] / size, cross[1] / size, cross[2] / size, w / size);
 }"""
-"""Script that lets a controller point at a place of the room."""
+"""JavaScript that points a controller at a position in the room."""
 _PRESS = "([hand, button, value]) => { device.controllers[hand].updateButtonValue(button, value); }"
 
 
@@ -93,13 +93,14 @@ def _images(page: Any, count: int = 4) -> None:
 
 
 def _in_room(page: Any, points: Any = None) -> np.ndarray:
-    """Return points (N, 3) of the scene in the room of the emulated headset, which has y up and its floor at 0.
+    """Return points (N, 3), m, of the scene in the space of the emulated headset, which has y up and its floor at y =
+    0.
 
-    Without ``points``, those are the nodes of the body.
+    By default, the points are the nodes of the body.
     """
     cameras, positions = page.evaluate(_READ)
     poses = np.reshape(cameras, (2, 4, 4)).transpose(0, 2, 1)
-    # The head is not turned, and between its eyes.
+    # The head is not rotated; its position is the mean of the eyes.
     rotation, eye = poses[0, :3, :3], poses[:, :3, 3].mean(axis=0)
     return np.array(HEAD) + (np.reshape(positions if points is None else points, (-1, 3)) - eye) @ rotation
 
@@ -110,7 +111,7 @@ def _middle(page: Any) -> np.ndarray:
 
 
 def _canvas(page: Any) -> np.ndarray:
-    """Return the next image of the session (H, W, 4), 0 to 1, with both eyes side by side."""
+    """Return the next image (H, W, 4) of the session, 0 to 1, with the views of both eyes side by side."""
     text = page.evaluate(
         """() => new Promise((resolve) => {
             const draw = stage.draw.bind(stage);
@@ -187,7 +188,7 @@ def test_selecting_a_place_moves_the_user_or_the_creature(chromium: Any, site: s
             _press(page, hand, "trigger", on=True)
             _press(page, hand, "trigger", on=False)
             moved = _middle(page) - before
-            # The user steps to the place, so that it comes under the head; or the creature comes to the place.
+            # In VR the user moves to the selected position; in AR the creature does.
             expected = np.array(HEAD) - place if kind == "VR" else place - before
             np.testing.assert_allclose(moved[[0, 2]], expected[[0, 2]], atol=0.05)
             assert abs(_in_room(page)[:, 1].min()) < 0.01

@@ -1,4 +1,4 @@
-"""A creature between two motions."""
+"""A live creature between two motions: balance, falls and getting up."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_pushed_body_comes_back_over_its_feet(tmp_path: Path):
 
 
 def test_a_toppled_body_stays_down_until_requested_to_get_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Then it gets up at once; otherwise a pawn on its side would get up by itself."""
+    """A fallen body ignores other motions. On the request "get up", it gets up at once."""
     monkeypatch.setattr(steering, "_FALL_TIME", 0.0)
     played = SteppedSession(coarse_pawn(), tmp_path)
     session = played.session

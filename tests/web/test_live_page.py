@@ -1,4 +1,4 @@
-"""The page of a live creature in a real Chromium: its view, its controls, its connection."""
+"""The page of a live creature in a real Chromium: view, controls and connection."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_pause_step_sliders_and_script(chromium: Any, session: Session):
 
 @in_browser
 def test_a_style_is_selected_by_name_or_by_number(chromium: Any, session: Session):
-    """The page shows the style of the session, and the next jump has it."""
+    """The page shows the style of the session; a selected style applies to the next jump."""
     with watched(chromium, session) as page:
         pressed = "[...document.querySelectorAll('.choice [aria-pressed=true]')].map((one) => one.textContent).join()"
         wait_until(page, "egs.live.state?.style.squash === 1")
@@ -179,7 +179,7 @@ def test_a_key_pressed_during_a_motion_shows_that_it_was_taken(chromium: Any, se
         page.keyboard.press(" ")
         wait_until(page, "egs.live.state?.doing === 'jump'")
         wait_until(page, "document.querySelector('.next').textContent === ''")
-        # At once, and as long as the session reports it.
+        # The page shows the queued motion at once, and as long as the session reports it.
         page.keyboard.press("h")
         assert page.text_content(".next") == "next: hop"
         wait_until(page, "egs.live.state?.queued === 'hop' && egs.live.sent === undefined")

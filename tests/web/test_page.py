@@ -80,7 +80,7 @@ def _camera(page: Any) -> Camera:
 
 
 def _own_picture(recording: Recording, page: Any, frame: int) -> np.ndarray:
-    """Return the same frame, rendered by this package with the camera of the page."""
+    """Return ``frame`` rendered by this package with the camera of the page."""
     camera = _camera(page)
     t, splats = recording.trajectory, recording.creature.splats
     deformer = Deformer(splats, embed_gaussians(splats, TetMesh(t.rest_positions, t.tets)))
@@ -124,7 +124,7 @@ def test_a_capture_trained_with_antialiasing_is_drawn_so(chromium: Any, recordin
 def test_the_page_relights_the_body_and_casts_the_shadow_of_the_main_light(
     chromium: Any, recording: Recording, tmp_path: Path
 ):
-    """A turned body has the colours of the film, and the floor is darker behind the body as seen from the light."""
+    """A rotated body has the colours of the film, and the floor is darker on the side away from the light."""
     direction = np.array([0.48, 0.64, 0.6])
     light = MainLight(direction, 5.0, 0.5, irradiance_form(0.3, 0.0, np.array([0.0, 0.0, 1.0]), 1.0, direction))
     t = recording.trajectory
@@ -162,7 +162,7 @@ def test_the_page_relights_the_body_and_casts_the_shadow_of_the_main_light(
 
 
 def test_the_comparison_detects_another_frame(chromium: Any, file: str, recording: Recording):
-    """Another frame, and splats that do not move, differ clearly."""
+    """The PSNR of images of different frames is clearly lower."""
     page, _ = opened(chromium, file)
     page.evaluate("egs.setLayer('ground', false); egs.player.seek(12)")
     assert _psnr_on_body(_own_picture(recording, page, 0), _picture(page)) < 35.0
@@ -175,7 +175,7 @@ _AZIMUTH = """(preset) => {
     const from = camera.position.clone().sub(controls.target);
     return Math.atan2(from.y, from.x) * 180 / Math.PI;
 }"""
-"""Script that selects a view; returns the direction from the body to the camera, degrees."""
+"""JavaScript that selects a view and returns the azimuth of the camera as seen from the body, degrees."""
 
 
 def test_front_and_side_look_at_the_front_that_was_found(chromium: Any, file: str, recording: Recording):
@@ -251,7 +251,8 @@ def test_each_shown_overlay_has_its_legend(chromium: Any, file: str):
 
 
 def test_muscles_at_rest_differ_from_the_body(chromium: Any, file: str):
-    """The first state has no activations. Most of a line is clearly lighter or darker than what it covers."""
+    """In the first state, without activations, the pixels of muscle lines are clearly lighter or darker than the
+    body."""
     page, _ = opened(chromium, file)
     body = _picture(page)
     page.evaluate("egs.setLayer('muscles', true)")
@@ -323,7 +324,8 @@ def test_play_advances_and_loops(chromium: Any, file: str):
 
 
 def test_a_slow_machine_waits_for_its_splats_to_be_sorted(chromium: Any, file: str):
-    """With an old order, the ground would be drawn over a body that has moved."""
+    """Playback does not advance until the splats are sorted, because with an outdated order, the ground could be drawn
+    over the moved body."""
     page, _ = opened(chromium, file)
     page.evaluate("Object.defineProperty(egs.viewers[0], 'sorting', { get: () => window.held })")
     page.evaluate("() => { window.held = true; egs.player.playing = true; egs.frameTime = 0.001; }")
@@ -453,7 +455,7 @@ def test_a_stopped_server_is_reported(chromium: Any, recording: Recording):
 
 
 def test_a_browser_without_webgl2_gets_a_message(file: str):
-    # Playwright can run only once in a process.
+    # Playwright can be started only once in a process.
     script = f"""
 from playwright.sync_api import sync_playwright
 with sync_playwright() as started:
@@ -469,7 +471,7 @@ with sync_playwright() as started:
 
 @pytest.fixture(scope="module")
 def on_a_floor(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The page of the same run over a grey floor of flat Gaussians, stored with the run as ``background.ply``."""
+    """Write the page of the same run with a grey floor of flat Gaussians, stored with the run as ``background.ply``."""
     folder = tmp_path_factory.mktemp("floor") / "run"
     shutil.copytree(run_folder, folder)
     t = Recording.read(folder).trajectory
@@ -494,7 +496,7 @@ def test_a_background_scene_is_on_the_ground_and_receives_the_shadow(chromium: A
     assert not page.evaluate("document.getElementById('layer-ground').checked")
     page.evaluate("egs.viewers[0].preset('top'); egs.setLayer('splats', false)")
     picture = _picture(page)
-    # Grey where light passes through, darker under the creature, nothing outside the range of the floor.
+    # The floor is grey, and darker in the shadow under the creature.
     middle = picture[picture.shape[0] // 2, picture.shape[1] // 2]
     assert 0.12 < middle.mean() < 0.3
     assert abs(np.median(picture[180:300, 10:40]) - 0.5) < 0.03

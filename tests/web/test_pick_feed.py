@@ -1,4 +1,4 @@
-"""The page of egs-warp pick in a real Chromium: two balls on a floor."""
+"""The page of ``egs-warp pick`` in a real Chromium, with two balls on a floor."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.support.picking import Commands, picking
 
 EACH = 1500
 BALLS = np.array([[-0.8, -0.5, 0.5], [0.8, -0.5, 0.5]])
-"""Point of each ball that is nearest to the front of the scene."""
+"""Foremost point (3,) of each ball as seen from the front of the scene."""
 
 
 @contextmanager
@@ -31,7 +31,7 @@ def opened_page(
     *size: int,
     commands: Commands | None = None,
 ) -> Iterator[tuple[Any, PickSession]]:
-    """Open the page of a session and look at the balls from the front; the page must not report errors."""
+    """Open the page of a session with the balls viewed from the front; the page must not report errors."""
     session, feed = picking(balls((-0.6, 0.9), between=1.6), path, commands)
     session.start()
     try:
@@ -55,7 +55,7 @@ def opened_page(
 
 
 def place_of(page: Any, session: PickSession, point: np.ndarray) -> tuple[float, float]:
-    """Return the position of a point of the capture in the page."""
+    """Return the position in the page, pixels, of a ``point`` (3,) of the capture."""
     x, y, z = session.source.frame.points(point).tolist()
     return tuple(
         page.evaluate(
@@ -70,7 +70,7 @@ def place_of(page: Any, session: PickSession, point: np.ndarray) -> tuple[float,
 
 
 def changed(page: Any, act: Callable[[], Any]) -> None:
-    """Do what changes the objects, and wait for their new state."""
+    """Call ``act``, which changes the objects, and wait for their new state."""
     page.evaluate("() => { window.before = egs.pick.state; }")
     act()
     wait_until(page, "egs.pick.state !== window.before && egs.pick.work === ''", seconds=120.0)

@@ -1,4 +1,4 @@
-"""Messages of the page of egs-warp pick."""
+"""Messages of the page of ``egs-warp pick``."""
 
 from __future__ import annotations
 

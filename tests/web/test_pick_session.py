@@ -1,4 +1,4 @@
-"""Session of egs-warp pick without a page."""
+"""Session of ``egs-warp pick`` without a page."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ EACH = 1500
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PickSession]:
-    """Session of two balls on a floor, after its proposal; its thread has ended, so that tests apply messages."""
+    """Create a session of two balls on a floor after its proposal. Its thread has ended, so that tests can apply
+    messages directly."""
     session, _ = picking(balls((-0.6, 0.9), between=1.6), tmp_path_factory.mktemp("pick") / "picked.json")
     session.prepare()
     yield session
@@ -46,7 +47,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PickSession]:
 
 
 def mark(session: PickSession, ball: int, *, inside: bool = True) -> Mark:
-    """Return a click on the middle of a ball, the left one is 0, from the front of the capture."""
+    """Return a click on the middle of a ball, as seen from the front of the capture; the left ball is 0."""
     frame = session.source.frame
     point = frame.points(np.array([(-0.8, 0.8)[ball], -0.5, 0.5]))
     eye = frame.points(np.array([(-0.8, 0.8)[ball], -5.0, 0.5]))
@@ -163,11 +164,12 @@ def test_before_a_film_the_page_offers_its_motion_and_ends(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_page_gets_the_heights_of_uneven_ground(tmp_path: Path):
-    """A ball on folds of 4 % of its height; the heights of the grid are those of the folds to 1 %."""
+    """For a ball on folds with an amplitude of 4 % of its height, the heights of the grid differ from the folds by at
+    most 1 % of the height."""
     cloud, is_ball = on_folds(0.04, length=0.9)
     session, _ = picking(cloud, tmp_path / "picked.json")
     frame = session.source.frame
-    # The heights are over the plane, wherever the user has put it.
+    # The heights are relative to the plane, wherever the user has moved it.
     plane = frame.plane(Plane(np.array([0.0, 0.0, 1.0]), -0.1))
     grid = session.ground_grid(Pick("ball", plane, is_ball))
     assert grid is not None and len(grid["heights"]) == grid["count"] ** 2

@@ -1,4 +1,4 @@
-"""The element <egs-player> and the creature for three.js scenes, in a real Chromium."""
+"""The element ``<egs-player>``, and the creature in three.js scenes, in a real Chromium."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ def site(folder: Path) -> Iterator[str]:
 
 
 def _open(chromium: Any, site: str, folder: Path, body: str) -> tuple[Any, list[str]]:
-    """Open a page with the player and ``body``; returns it and the list of the browser's errors and warnings."""
+    """Open a page with the player and the HTML ``body``; return it and the list of the browser's errors and
+    warnings."""
     html = f'{_HEAD}<script type="module" src="player.js"></script>{body}</body></html>'
     (folder / "index.html").write_text(html, encoding="utf-8")
     page = chromium.new_page(viewport={"width": 640, "height": 480})
@@ -100,7 +101,7 @@ def _camera(page: Any) -> Camera:
 
 
 def _own_picture(run: FinishedRun, page: Any, frame: int) -> np.ndarray:
-    """Return the same frame, rendered by this package with the camera of the page."""
+    """Return ``frame`` rendered by this package with the camera of the page."""
     cloud = run.deformer().deform(run.trajectory.positions[run.steps[frame]]).cloud
     red, green, blue = (int(_BACKGROUND[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
     return np.clip(render_gaussians(cloud, _camera(page), background=(red, green, blue)).colour.numpy(), 0.0, 1.0)
@@ -306,12 +307,13 @@ _COUNT_RESOURCES = """() => {
         target.last = target.currentTime;
     }, { capture: true });
 }"""
-"""Script that counts the objects of WebGL that exist and the loops of all players."""
+"""JavaScript that counts the existing WebGL objects and the loops of all players."""
 
 
 def _memory(page: Any) -> tuple[float, dict[str, int]]:
-    """Return the memory that scripts use, array buffers included, in MB, and the number of objects of WebGL."""
-    # Without a sort, whose buffers would be in transfer between the page and a worker.
+    """Return the memory that scripts use, including array buffers, in MB, and the number of WebGL objects of each
+    kind."""
+    # Pause, because the buffers of a running sort would be in transfer between the page and a worker.
     page.evaluate("for (const player of document.querySelectorAll('egs-player')) player.pause()")
     wait_until(page, "[...document.querySelectorAll('egs-player')].every(({ view }) => !view.sorting)")
     session = page.context.new_cdp_session(page)
@@ -334,7 +336,7 @@ def test_memory_is_flat_over_a_hundred_loops_of_two_players(chromium: Any, site:
     page.add_init_script(f"({_COUNT_RESOURCES})()")
     page.goto(f"{site}/loops.html")
     _wait_until_ready(page)
-    # The browser compiles scripts at first.
+    # In the first loops, the browser compiles scripts.
     wait_until(page, "loops >= 60")
     before, resources = _memory(page)
     page.evaluate("loops = 0; one.play(); two.play()")

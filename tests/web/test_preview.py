@@ -1,4 +1,4 @@
-"""The still capture that a live page shows while its creature is prepared."""
+"""The static capture that a live page shows while its creature is prepared."""
 
 from __future__ import annotations
 

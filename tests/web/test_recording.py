@@ -1,4 +1,4 @@
-"""Packets of a finished run."""
+"""Recordings: the packets of a finished run for the page."""
 
 from __future__ import annotations
 
@@ -62,7 +62,8 @@ def test_a_frame_is_as_small_as_documented(run_folder: Path):
 
 
 def test_the_creature_file_equals_the_video(run_folder: Path):
-    """The embedding is recomputed from the splats of the file and the rest cage of the trajectory."""
+    """An embedding that is computed from the splats of the file and the rest cage of the trajectory gives the means of
+    the video."""
     recording = Recording.read(run_folder)
     t, made = recording.trajectory, recording.creature
     deformer = Deformer(made.splats, embed_gaussians(made.splats, TetMesh(t.rest_positions, t.tets)))
@@ -119,7 +120,7 @@ def test_a_scene_behind_it_travels_too(run_folder: Path, tmp_path: Path):
 
 
 def _shorten(path: Path, *names: str, end: int) -> None:
-    """Shorten these arrays of a file to row ``end``: each array is valid, but the file is inconsistent."""
+    """Truncate the arrays ``names`` of a file at row ``end``, so that each is valid but the file is inconsistent."""
     with np.load(path) as file:
         arrays = dict(file)
     arrays |= {name: arrays[name][:end] for name in names}

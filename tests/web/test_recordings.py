@@ -1,4 +1,4 @@
-"""Takes of a live session."""
+"""Takes that a live session records, and its scripts."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_script_keeps_the_style_of_each_jump(style: Style, tmp_path: Path):
 
 @pytest.fixture(scope="module")
 def take(tmp_path_factory: pytest.TempPathFactory) -> tuple[SteppedSession, Path]:
-    """A jump on the spot, recorded from its crouch to rest; before it, a twist that is not part of it."""
+    """Record a jump from its crouch until the body rests, after a twist that is not part of the take."""
     folder = tmp_path_factory.mktemp("takes")
     played = SteppedSession(coarse_pawn(), folder)
     played.request("motion", text="twist 20 0 0.1")

@@ -1,4 +1,4 @@
-"""The server of the page: accessible only to this machine and this page."""
+"""The server of the page, which only this machine and its own page can access."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ def test_nothing_else_is_served(server: PageServer, path: str):
 
 
 def test_files_of_the_run_folder_are_not_served(run_folder: Path, tmp_path: Path):
-    """Neither files in the folder nor targets of links in it: the page receives data made from the run, and no path
-    names a file."""
+    """Neither files in the folder nor targets of links in it are served: the page receives data computed from the run,
+    and no path of the server names a file."""
     folder, secret = tmp_path / "run", tmp_path / "secret.txt"
     shutil.copytree(run_folder, folder)
     secret.write_text("nobody's business")
@@ -105,7 +105,7 @@ def _socket(server: PageServer, origin: str | None = "own"):
 
 
 def _taken_up_again(server: PageServer) -> bool:
-    """Return True if a page that reconnects, as pages do, receives the header."""
+    """Return True if a page that reconnects receives the header."""
     for _ in range(50):
         with _socket(server) as page:
             try:

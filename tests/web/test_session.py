@@ -66,8 +66,8 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
 
 
 def _still_seconds(session: Session) -> float:
-    """Return the seconds for which its state stays the same, once the current step is done, which takes time on a busy
-    core."""
+    """Return the time, s, for which the state of the session stays the same after the current step, which may take time
+    on a busy core."""
     for _ in range(30):
         before = session.state.time
         time.sleep(1.0)
@@ -203,7 +203,7 @@ def test_a_push_acts_in_the_next_step_and_the_take_passes_the_audit(tmp_path: Pa
     played.request("record", on=True)
     played.step()
     gained = body.centre_of_mass(session.state.velocities) / body.speed_unit
-    # The ground has had a step to reduce the momentum by friction; the take records the whole push.
+    # Friction has already reduced the momentum for one step; the take records the whole push.
     assert 0.2 < gained[0] / 0.05 <= 1.0 and 0.2 < gained[1] / -0.1 <= 1.0
     played.step(4)
     spin = body.angular_momentum(session.state.positions, session.state.velocities)

@@ -1,4 +1,4 @@
-"""A pull: its force, and its effect in a step."""
+"""Pull of the user by a spring: its force, and its effect in a step."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ def test_force_is_that_of_a_spring_up_to_its_strongest():
 
 
 def test_a_step_under_a_pull_has_its_impulse_and_its_torque():
-    """In free flight without muscles: P+ = P + dt (F + m g), L+ = L + dt (x - c) x F, to rounding."""
+    """In free flight without muscles, a step with the force F at x changes the momentum by dt (F + m g) and the angular
+    momentum by dt (x - c) x F, to rounding."""
     creature = coarse_pawn()
     body, stepper = creature.body, creature.stepper
     spring = Spring(body, int(np.argmax(body.mesh.nodes[:, 2])))

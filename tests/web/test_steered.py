@@ -1,4 +1,4 @@
-"""Keys, gamepad and pointer steer a creature, in a real Chromium."""
+"""Keys, gamepad and pointer that steer a creature, in a real Chromium."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_a_click_on_the_ground_sets_the_goal(chromium: Any, session: Session):
         goal = np.array(page.evaluate("egs.live.state?.goal"))
         start = np.array(page.evaluate("egs.viewers[0].centreOfMass.toArray()"))[:2]
         assert np.linalg.norm(goal - start) > 0.25
-        # About a hundred steps of a walk, while the page is rendered on the same cores.
+        # The walk takes about a hundred steps of the solver, while the page is rendered on the same cores.
         wait_until(page, "egs.live.state?.goal === null", seconds=600.0)
         assert not [line for line in page.evaluate("egs.live.messages") if line.startswith("go")]
         place = session.steering.place

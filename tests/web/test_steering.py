@@ -1,4 +1,4 @@
-"""Scheduling of the motions of a live creature."""
+"""Steering of a live creature: queue of motions, driving, navigation and styles."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_new_request_replaces_the_queued_one(tmp_path: Path):
 
 
 def test_a_drive_lasts_until_another_request(tmp_path: Path):
-    """A command is queued behind the current motion; the next command, or motion, replaces it."""
+    """A drive command is queued after the current motion and lasts until another command or motion replaces it."""
     played = SteppedSession(coarse_pawn(), tmp_path)
     steering = played.session.steering
     played.request("drive", forward=0.1)
@@ -68,7 +68,7 @@ def test_a_driven_body_stands_after_a_zero_command(tmp_path: Path):
 
 
 def test_a_style_applies_to_later_motions(tmp_path: Path):
-    """The active jump keeps its style; after standing up or a rebuild, the new style stays."""
+    """The active jump keeps its style; the new style applies to later jumps, also after the creature is rebuilt."""
     played = SteppedSession(coarse_pawn(), tmp_path)
     session = played.session
     played.request("motion", text="jump 0 0.1, jump 0 0.1")
@@ -118,7 +118,7 @@ def test_navigation_turns_first_and_then_jumps_towards_its_goal():
     assert straight is not None and straight.request.name == "jump"
     assert straight.request.asked["distance"] == pytest.approx(0.5, abs=1e-3)
     assert leg(0.9 * ARRIVAL_DISTANCE * left) is None
-    # It does not turn towards a point so near.
+    # The body does not turn towards a point that is this near.
     near = leg(0.2 * left)
     assert near is not None and near.request.name == "jump"
 
@@ -132,7 +132,7 @@ def test_navigation_without_progress_is_abandoned():
 
 
 def test_a_body_with_feet_walks_there():
-    """The body walks towards the point, ahead and sideways, by at most the length of a leg at once."""
+    """The body walks directly towards the point, ahead and sideways; a single walk has a limited length."""
     place = coarse_creature(
         stool(), forward=np.array([0.9, 0.3, 0.0]), sag=0.01, strength=20.0, settle_first=False
     ).place

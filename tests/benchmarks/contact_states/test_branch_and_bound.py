@@ -14,8 +14,8 @@ from tests.support.contact_programs import optimum_of_each, small_problem
 
 @pytest.mark.parametrize(("contacts", "directions", "seeds"), [(1, 4, 120), (1, 8, 3), (2, 4, 3), (2, 8, 3), (3, 4, 3)])
 def test_the_optimum_equals_brute_force(contacts: int, directions: int, seeds: int) -> None:
-    """Eq. (9), Eq. (13): the objective is that of the best state, the solution is complementary, and far fewer QPs than
-    states are solved. Over many problems of one contact, each state is the best one at least once.
+    """Eq. (9), Eq. (13): the objective equals the minimum over all states, the solution is complementary, and far fewer
+    QPs than states are solved. Over many problems of one contact, each state is the best one at least once.
     """
     best_states = set()
     for seed in range(seeds):
@@ -36,7 +36,7 @@ def test_the_optimum_equals_brute_force(contacts: int, directions: int, seeds: i
 
 
 def test_the_bounds_of_the_activations_hold() -> None:
-    """The optimum has the bounds of the program, which need not be -1 and 1."""
+    """The optimum is within the bounds of the program, which need not be -1 and 1."""
     program = small_problem(5).pyramid
     narrow = replace(program, lower=np.full(3, -0.05), upper=np.full(3, 0.02))
     found, best = exact_states(narrow), min(value for value, _ in optimum_of_each(narrow).values())
@@ -44,7 +44,7 @@ def test_the_bounds_of_the_activations_hold() -> None:
 
 
 def test_starts_change_only_the_number_of_qps() -> None:
-    """A good start prunes; a bad one is discarded."""
+    """The optimum does not depend on the initial states; the optimal states as a start cost at most one more QP."""
     program = small_problem(5, contacts=3).pyramid
     plain = exact_states(program)
     assert plain is not None
@@ -83,7 +83,7 @@ def test_the_bound_of_a_limited_search_is_valid() -> None:
 
 @pytest.mark.parametrize("objective", [0.0, 0.3, -4.0, 1e3])
 def test_optimality_gap_of_a_proof(objective: float) -> None:
-    """The gap is at most a millionth of the objective plus one."""
+    """A result is proved optimal if objective - bound <= 1e-6 (1 + abs(objective))."""
     for share, proved in ((0.9e-6, True), (1.1e-6, False)):
         bound = objective - share * (1.0 + abs(objective))
         assert ExactResult(np.zeros(1), np.zeros(1, int), objective, bound, 1).proved == proved

@@ -1,4 +1,4 @@
-"""Searches over contact states against brute force (Eq. 13), on healthy and on degenerate contact sets."""
+"""Searches over contact states against brute force (Eq. 13), on regular and on degenerate contact sets."""
 
 from __future__ import annotations
 
@@ -44,9 +44,11 @@ def is_complementary(program: PyramidProgram, y: np.ndarray, tolerance: float) -
 
 @pytest.mark.parametrize("solver", [QpSolver.OSQP, QpSolver.DAQP])
 def test_relaxed_against_brute_force(solver: QpSolver) -> None:
-    """Eq. (13): within 2 % of brute force in 78 % of 60 problems, never below it, in at most 5 QPs on average.
+    """Eq. (13): the objective is within 2 % of brute force in at least 47 of 60 problems, and never below it. The
+    search takes at most 5 QPs on average.
 
-    These problems are harder than those of a body: in most of them the relaxed optimum is no hint at the true one.
+    These problems are harder than the problems of a body: in most of them, the relaxed optimum is far from the true
+    one.
     """
     near, counts = 0, []
     for seed in range(60):
@@ -93,14 +95,14 @@ def test_more_qps_are_never_worse() -> None:
 
 
 def test_an_uncertain_search_may_triple_the_limit() -> None:
-    """As documented: some of many problems take all of it, none takes more."""
+    """With a limit of 2 QPs, no search takes more than 6; some searches take all 6."""
     programs = [small_problem(seed, contacts=3).pyramid for seed in range(20)]
     counts = [search(program, StateSearch.RELAXED, limit=2).qp_count for program in programs]
     assert max(counts) == 6 and min(counts) <= 3
 
 
 def test_contact_under_given_activations_obeys_every_pair() -> None:
-    """Eq. (9): for any activations there are contact forces, found to rounding."""
+    """Eq. (9): for any activations, the contact forces satisfy all complementarity conditions to rounding."""
     for seed in range(10):
         program = small_problem(seed, contacts=4).pyramid
         activations = np.random.default_rng(seed).uniform(-1, 1, 3)
@@ -133,8 +135,8 @@ def degenerate_frames() -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("name", list(degenerate_frames()))
 @pytest.mark.parametrize("solver", [QpSolver.OSQP, QpSolver.DAQP])
 def test_degenerate_contact_sets_have_a_solution(name: str, solver: QpSolver) -> None:
-    """Contacts in one line, duplicates, one point, 40 points on a rigid base: the result is finite and obeys every
-    pair.
+    """For contacts in one line, duplicate contacts, a single point and 40 points on a rigid base, the result is finite
+    and satisfies all complementarity conditions.
     """
     frame = degenerate_frames()[name]
     for seed in range(4):
@@ -146,8 +148,8 @@ def test_degenerate_contact_sets_have_a_solution(name: str, solver: QpSolver) ->
 
 
 def test_states_that_contradict_each_other_are_replaced() -> None:
-    """Points at one rigid place with different gaps cannot all be static: the search starts from the solution of the
-    contact problem instead.
+    """Contacts at the same point of a rigid body with different gaps cannot all stick: the search starts from the
+    solution of the contact problem instead.
     """
     frame = degenerate_frames()["same"]
     problem = small_problem(1, contacts=6, frame=frame)
@@ -162,7 +164,7 @@ def test_states_that_contradict_each_other_are_replaced() -> None:
 
 def test_every_search_solves_the_same_program() -> None:
     """Eq. (9), Eq. (13): each search gives activations within their bounds, forces within the cone and the correct
-    objective; in a few QPs the strategies of the engine come nearer to the optimum on average than ``qpcc``.
+    objective. With few QPs, the mean objective of the engine's strategies is lower than that of ``qpcc``.
     """
     reached: dict[Strategy | StateSearch, list[float]] = {kind: [] for kind in (*Strategy, *StateSearch)}
     for seed in range(24):
@@ -179,8 +181,7 @@ def test_every_search_solves_the_same_program() -> None:
             assert found.x is not None and found.qp_count > 0
             forces = found.x[3:].reshape(-1, 3)
             slack = FRICTION * forces[:, 0] - np.linalg.norm(forces[:, 1:], axis=1)
-            # A mode region replaces the cone by a pyramid around the start, which may violate a facet by 0.02, and the
-            # objective likewise.
+            # A mode region replaces the cone by a pyramid around the start; forces may violate a facet by 0.02.
             broken = 0.03 if isinstance(kind, Strategy) else 1e-5
             assert np.abs(found.x[:3]).max() <= 1.0 + 1e-6 and slack.min() > -broken, kind
             assert found.objective == pytest.approx(program.objective(found.x), rel=1e-4, abs=1e-4)
@@ -191,7 +192,7 @@ def test_every_search_solves_the_same_program() -> None:
 
 
 def test_static_starts_with_all_contacts_static() -> None:
-    """For any prediction, with one QP."""
+    """The search ``STATIC`` ignores the predicted states and solves one QP in which all contacts stick."""
     tried = 0
     for seed in range(40):
         program = small_problem(seed).pyramid

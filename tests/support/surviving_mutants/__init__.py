@@ -14,7 +14,7 @@ SURVIVORS: list[Survivor] = [*CONTACT, *LOCOMOTION, *FEM, *DEFORMATION, *SEGMENT
 
 
 def reason_for(mutant: Mutant) -> str | None:
-    """Return why this mutant may survive; None if it must not."""
+    """Return the reason why this mutant may survive, or None if it must be killed."""
     for survivor in SURVIVORS:
         if (f"egs_warp/{survivor.file}", survivor.before, survivor.after) == (
             mutant.file,
