@@ -227,7 +227,7 @@ def hidden_below(cloud: GaussianCloud, plane: Plane, *, margin: float) -> Gaussi
     """Return ``cloud`` with the Gaussians below ``plane`` made transparent; number and order do not change.
 
     A Gaussian is below the plane if its mean is more than ``margin`` (world units) below it, or if a third of its mass
-    is below the plane and its standard deviation reaches deeper than four margins.
+    is below the plane and the point one standard deviation below its mean is deeper than four margins.
     """
     heights = plane.heights(cloud.means.numpy())
     axes = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
