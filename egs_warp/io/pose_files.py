@@ -127,8 +127,7 @@ def _largest(models: list[Path], source: Path) -> tuple[Path, str]:
 
 
 def _data_folder(model: Path, source: Path) -> Path:
-    """Return the folder of the data set of a COLMAP model: the first folder above it that does not contain only models.
-    """
+    """Return the folder of the data set of a COLMAP model, above the folders that contain only models."""
     folder = model.absolute()
     if folder.name.isdecimal() and folder.parent.name in _BETWEEN:
         folder = folder.parent
