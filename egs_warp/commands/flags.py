@@ -35,7 +35,10 @@ def flag_of(argument: str) -> str:
 
 
 def named_path(text: str) -> Path:
-    """Return ``text`` as a path. Raises ``ArgumentTypeError`` for an empty text, not to use the working folder."""
+    """Return ``text`` as a path.
+
+    Raises ``ArgumentTypeError`` for an empty text, which would otherwise name the working folder.
+    """
     if not text.strip():
         raise argparse.ArgumentTypeError("the name is empty; give a name")
     return Path(text)

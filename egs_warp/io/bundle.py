@@ -53,8 +53,7 @@ class BundleCage:
     """(r, 6) lengths of semi-axes that end beyond the neighbours of the mean's tetrahedron, in standard deviations
     along the axis; 0 for other semi-axes."""
     arm_bulges: np.ndarray
-    """(r, 3) shifts of the mean due to the difference of two opposite semi-axes, in standard deviations along the axis.
-    """
+    """(r, 3) shifts of the mean due to the difference of two opposite semi-axes, in standard deviations along them."""
     max_stretch: float
     """Maximum stretch of a semi-axis relative to the material at its two ends."""
     nodes: np.ndarray

@@ -24,8 +24,7 @@ def conversion_loss(
         before: The capture that was written.
         after: The written file, read back.
         order: (n,) index in ``before`` of each Gaussian of the file, as returned by its writer; None if the order is
-        the
-            same.
+            the same.
         origin: (3,) offset of ``before`` that the file includes (``stored_origin``); None if it includes none.
     """
     old, new = before.cloud, after.cloud

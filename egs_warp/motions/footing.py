@@ -14,8 +14,8 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.support import SupportPolygon, is_line
 
 LANDED_HEIGHT = 0.005
-"""Height above the ground, in body heights, below which a foot has landed at the end of its swing, even without load.
-"""
+"""Height above the ground, in body heights, below which a foot at the end of its swing is considered landed, with or
+without load."""
 _AMBIGUOUS_FRACTION = 0.3
 """Minimum difference between the distances of a contact point to two feet for it to belong to the nearer one, as a
 fraction of the distance between the feet."""

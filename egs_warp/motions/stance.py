@@ -38,8 +38,8 @@ SUPPORT_MARGIN = 0.95
 _MIN_FOOTPRINT = 0.01
 """Half width in body heights of the square about the centre of mass that every footprint contains."""
 _PUSH_REACH = 0.04
-"""Half width, in body heights, of the square about the centre of mass within which every centre of pressure is allowed.
-"""
+"""Half width, in body heights, of the square about the centre of mass in which the centre of pressure may always lie,
+even outside the footprint."""
 _BALANCE_PRIORITY_MARGINS = (0.25, 0.5)
 """Capture margins (``BalanceController.capture_margin``) between which the priority of balance over uprighting grows
 from 0 to 1."""
