@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.report import Report
 
 EXIT_NOT_AS_REQUESTED = 3
-"""Exit status of a run that has written its files, but is not what was requested (``State.is_failure``)."""
+"""Exit status of a run that has written its files but did not achieve the requested motion (``State.is_failure``)."""
 _WRITES = (NAME, "trajectory.npz", "plots.png", "cage.vtu", "sheet.png", "creature.npz", "report.json")
 """Files that every run writes. The names of other files depend on the motion."""
 EXAMPLES = (

@@ -30,7 +30,8 @@ EXAMPLES = (
 _LAST_LINE = 1.0
 """Time for which the server continues, so that the page receives its last line, s."""
 _DISTANCE = 1.25
-"""Distance of the initial camera relative to that of a preview, which leaves space for the arrows."""
+"""Ratio of the distance of the initial camera to the distance for a preview; above 1, it leaves space for the
+arrows."""
 
 
 def add_parser(commands: Commands) -> None:

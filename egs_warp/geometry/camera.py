@@ -18,9 +18,9 @@ class Camera:
     cx: float
     cy: float
     rotation: np.ndarray
-    """(3, 3) float64, world to camera."""
+    """(3, 3) float64, rotation from world to camera axes."""
     translation: np.ndarray
-    """(3,) float64, world units."""
+    """(3,) float64, translation from world to camera, world units."""
     near: float = 0.01
     far: float = 1e6
 

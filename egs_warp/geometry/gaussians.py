@@ -35,7 +35,7 @@ class GaussianCloud:
     __repr__ = short_repr
 
     means: wp.array
-    """(n,) vec3, scene units (metres once animated)."""
+    """(n,) vec3, scene units; metres in the frame of a body."""
     rotations: wp.array
     """(n,) vec4, unit quaternions w, x, y, z."""
     log_scales: wp.array

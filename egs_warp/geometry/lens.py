@@ -32,7 +32,7 @@ class Lens:
     rational: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Coefficients of r^2, r^4, r^6 in the denominator (OpenCV's k4 to k6)."""
     tangential: tuple[float, float] = (0.0, 0.0)
-    """Coefficients p1, p2."""
+    """Coefficients p1 and p2 of the tangential distortion."""
     thin_prism: tuple[float, float] = (0.0, 0.0)
     """Coefficients of r^2 of the thin prism terms along x and y."""
     field_of_view: float = 0.0

@@ -26,7 +26,7 @@ class TetMesh:
 
     @classmethod
     def oriented(cls, nodes: np.ndarray, tets: np.ndarray) -> TetMesh:
-        """Create the mesh with each left-handed tetrahedron (fTetWild's winding) made right-handed.
+        """Create the mesh, and invert left-handed tetrahedra (fTetWild's winding), so that all are right-handed.
 
         Raises ``UserError`` if an element has no volume.
         """

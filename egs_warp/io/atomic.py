@@ -136,8 +136,8 @@ def sweep_all(folder: Path) -> None:
 
 @contextmanager
 def lock(path: Path) -> Iterator[bool]:
-    """Yield True if this process holds the lock file ``path``, which is removed when the block ends, and False if
-    another process holds it."""
+    """Lock the file ``path`` for the duration of the block, and remove it afterwards. Yield True if this process has
+    the lock, and False if another process has it."""
     while True:
         descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
         if fcntl is not None and not _try_lock(descriptor):

@@ -64,7 +64,7 @@ FLAT_SOLE_SPEED = 0.1
 """Speed towards the feet, in sqrt(g H), above which the soles must be flat; at lower speeds, they are flattened
 partially."""
 POSE_BLEND_TIME = 0.3
-"""Time in sqrt(H / g) in which the pose of a phase replaces that of the previous one."""
+"""Time in sqrt(H / g) for the transition from the pose of one phase to the pose of the next."""
 TAKE_OFF_RELEASE_TIME = 0.6
 """Time in sqrt(H / g) after take-off in which the pose of the landing is adopted."""
 URGENT_CAPTURE_MARGIN = 0.5

@@ -230,7 +230,7 @@ def plan_jump(
         lean: forward displacement of the centre of mass during the crouch, m.
         friction: Coulomb coefficient of the ground.
         landing_time: time in which the fall is stopped, s.
-        style: factors of the jump; None is the default style.
+        style: factors of the jump; None uses the default style.
     """
     style = style or Style()
     time_unit = np.sqrt(height / gravity)

@@ -67,7 +67,7 @@ class Script:
         return round(frames * max(1.0, height**0.5))
 
     def style(self, text: str | None) -> Style:
-        """Return the style of the script's jumps from ``text`` (``read_style``); None is the default style.
+        """Return the style of the script's jumps from ``text`` (``read_style``); None uses the default style.
 
         Raises:
             UserError: for an invalid text, and if no motion jumps.
@@ -163,7 +163,7 @@ def own_script(name: str, begin: MotionFactory, *, seconds: float) -> Script:
     """Return a script of one motion of your own class.
 
     Args:
-        name: name of the motion in reports and of the video file; it must differ from those of built-in motions.
+        name: name of the motion in reports, and of the video file; it must differ from the names of built-in motions.
         begin: function that returns the motion of a body from its stance; the motion has the attributes of
             ``BodyMotion``.
         seconds: time limit for a body of 1 m, s; the motion is cut off after it.

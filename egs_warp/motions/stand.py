@@ -68,7 +68,7 @@ class Stand:
         self._time_unit = float(np.sqrt(stance.body.height / self._gravity))
         self._height = crouch * self.controller.standing_height
         self.posture: PostureTarget | None = None
-        """Posture of the next time step; None is upright."""
+        """Posture of the next time step; None for the upright posture."""
         self._rest_detector = RestDetector(stance.body)
         self._is_resting = at_rest
 

@@ -160,7 +160,7 @@ class RockingPosture:
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
         """Return the target nodes (N, 3), see ``WalkPosture.pose``. The footholds define the rotation of the base, and
-        ``heading`` that of the whole body."""
+        ``heading`` the rotation of the whole body."""
         middle, between, rest = feet[:, :3].mean(axis=0), feet[0, :3] - feet[1, :3], self._between
         yaw = np.arctan2(between[1], between[0]) - np.arctan2(rest[1], rest[0])
         across = np.array([between[1], -between[0], 0.0]) / np.hypot(*between[:2])

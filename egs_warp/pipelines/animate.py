@@ -94,7 +94,7 @@ class AnimateOptions:
     source: str = "capture"
     """Name of the capture in the report."""
     notes: tuple[str, ...] = ()
-    """Notes for the report, before those of the run."""
+    """Notes for the report that precede the notes of the run."""
 
     def __post_init__(self) -> None:
         for name, value in (("distance", self.distance), ("height", self.height)):
@@ -191,7 +191,7 @@ def animate(
         up: (3,) Up in the capture's frame, or an axis (``make_creature``).
         plane: Ground plane in the capture's frame (``make_creature``).
         background: Gaussians behind the object, in the capture's frame and units; None draws a plain floor.
-        options: Targets, video and creature; None is the default.
+        options: Targets, video and creature; None uses the default.
         overwrite: Move an earlier run in ``out`` aside.
         resume: Continue the interrupted run in ``out``; equal arguments give equal bits.
         quiet: Show no progress bars.

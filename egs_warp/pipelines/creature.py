@@ -71,8 +71,8 @@ class CreatureOptions:
     metres_per_unit: float | None = None
     """Length of one unit of the capture, m; None makes the body 1 m tall."""
     sag: float = DEFAULT_SAG
-    """Fraction of its height by which the body sags under its weight, which defines its stiffness. A body that its
-    weight would bend out of shape is made stiffer."""
+    """Fraction of its height by which the body sags under its weight, which defines its stiffness. The stiffness is
+    increased if the weight would bend the body out of shape."""
     overlap: float = 0.0
     """Softness of parts that stick out (an ear, an arm, a tail; ``find_protrusions``), 0 to 0.5: the fraction of its
     length by which such a part would sag under its weight. Soft parts lag behind the body and settle after it. With 0,
@@ -96,7 +96,7 @@ class CreatureOptions:
     solids: tuple[Solid, ...] = ()
     """Steps and walls in addition to the ground."""
     settings: LocomotionSettings | None = None
-    """Solver settings, such as the contact strategy and the QP solver; None is the default."""
+    """Solver settings, such as the contact strategy and the QP solver; None uses the default."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.friction <= MAX_FRICTION:
@@ -187,7 +187,7 @@ def make_creature(
             orthogonal to ``up``. If ``plane``, ``up`` and ``options.ground`` are all None, the up direction of the file
             is used; if the file has none, it is estimated (``guess_up``). A note reports it.
         plane: Ground plane.
-        options: Body, muscles, ground and solver; None is the default.
+        options: Body, muscles, ground and solver; None uses the default.
         progress: Called with the name of each stage as it starts.
 
     Raises:
@@ -307,7 +307,7 @@ def plane_below(cloud: GaussianCloud, ground: HeightField) -> Plane:
 
 
 def changed_creature(creature: Creature, *, friction: float, sag: float, muscles_file: Path | None) -> Creature:
-    """Return ``creature`` at rest with another friction and stiffness; cage and ground stay the same.
+    """Return ``creature`` at rest with another friction and stiffness, but the same cage and ground.
 
     Args:
         creature: The creature to change.
@@ -350,7 +350,7 @@ class PlacedCage:
     frame: BodyFrame
     """Frame of the body in the capture."""
     gaussians: GaussianCloud
-    """Gaussians that define the body (``body_gaussians``); a subset of those of a large capture
+    """Gaussians that define the body (``body_gaussians``); in a large capture, these are a subset
     (``representatives``)."""
     cage: Cage
     """Tetrahedral mesh around the Gaussians."""
@@ -532,8 +532,8 @@ def initial_stance(creature: Creature, *, step: float | None = None, style: Styl
 
     Args:
         creature: The creature.
-        step: Maximum step size, s (``solver_steps``); None is the default.
-        style: Style of jumps; None is the default.
+        step: Maximum step size, s (``solver_steps``); None uses the default.
+        style: Style of jumps; None uses the default.
     """
     body, start = creature.body, creature.start
     up = -body.gravity / np.linalg.norm(body.gravity)

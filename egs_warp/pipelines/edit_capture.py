@@ -28,7 +28,7 @@ _FLOATER_SHARE = 0.01
 
 @dataclass(frozen=True)
 class CaptureEdits:
-    """Changes of a capture, in the order in which they are made; the default changes nothing."""
+    """Changes of a capture, in the order of their application; the default changes nothing."""
 
     box: np.ndarray | None = None
     """(2, 3) Opposite corners of a box in the frame and units of the file; Gaussians with means outside are removed."""
@@ -72,8 +72,8 @@ class CaptureEdits:
         return Rotation.from_euler("xyz", self.rotation, degrees=True)
 
     def turned_up(self, up: np.ndarray | None, vertical_axis: int | None) -> tuple[np.ndarray | None, int | None]:
-        """Return the up direction (3,) and the vertical axis of the edited capture (``Capture``), from those of the
-        capture."""
+        """Return the up direction (3,) and the vertical axis (``Capture``) after the edits; the arguments are the
+        values before."""
         if self.up is not None:
             up, vertical_axis = Y_UP, None
         turn = self._turn()

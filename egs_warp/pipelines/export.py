@@ -54,7 +54,7 @@ def export_splats(
         kind: A key of ``WRITERS``.
         frame: Export only this frame; negative numbers count from the end.
         every: Export each ``every``-th frame.
-        degree: SH degree of the colours; None keeps that of the capture.
+        degree: SH degree of the colours; None keeps the degree of the capture.
         quiet: Show no progress bar.
 
     Raises:

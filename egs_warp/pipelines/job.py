@@ -36,9 +36,9 @@ class Job:
     max_seconds: float | None = None
     """Time limit of the motion, s; None uses the motion's own limit."""
     step: float | None = None
-    """Maximum step size, s; None is the default."""
+    """Maximum step size, s; None uses the default."""
     style: Style | None = None
-    """Style of jumps; None is the default."""
+    """Style of jumps; None uses the default."""
     pushes: tuple[Push, ...] = ()
     """Pushes during the run."""
     get_up: bool = True

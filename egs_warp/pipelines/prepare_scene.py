@@ -141,7 +141,7 @@ def prepare_scene(
         up: (3,) Approximate up direction, or an axis such as ``"-y"``; None uses the one in the file, or else an
             estimate.
         plane: The ground plane; None finds it.
-        options: Options; None is the default.
+        options: Options; None uses the default.
         progress: Called with the name of a stage and its finished fraction.
 
     Raises:

@@ -103,7 +103,7 @@ def write_scene(key: str, scene: PreparedScene) -> str | None:
 
 
 class _Hash:
-    """File object that hashes what is written."""
+    """File object that hashes the data written to it."""
 
     def __init__(self) -> None:
         self.sha256 = hashlib.sha256()

@@ -149,8 +149,8 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 def around(camera: Camera, positions: np.ndarray, *, count: int | None = None) -> list[Camera]:
     """Return cameras on a circle around the vertical axis through the centre of ``positions`` (f, N, 3).
 
-    Their distance is about the smallest at which every camera shows all positions. There are ``count`` cameras, by
-    default f.
+    Their distance is approximately the minimum at which every camera shows all positions. There are ``count`` cameras,
+    by default f.
     """
     points = positions.reshape(-1, 3)
     low, high = points.min(axis=0), points.max(axis=0)

@@ -206,8 +206,8 @@ def simulate(
         frames: Number of frames at 60 Hz, the first at rest; None runs until the body has come to rest or fallen, or
             the time limit is reached.
         max_seconds: Time limit of the motion, s; None uses the motion's own limit.
-        step: Maximum step size, s; None is the default.
-        style: Style of jumps; None is the default.
+        step: Maximum step size, s; None uses the default.
+        style: Style of jumps; None uses the default.
         pushes: Pushes during the run.
         get_up: If the body falls, get up and continue.
         ends_at_fall: If the body falls, end the run at the step at which the fall is detected.

@@ -118,14 +118,14 @@ def train(
         iterations: Number of optimiser steps.
         max_gaussians: Maximum number of Gaussians; None adds Gaussians as long as the renders improve.
         sh_degree: SH degree of the capture, 0 to 3.
-        background: Background colour, 0 to 1; None is white for photos with alpha, otherwise the mean colour at the
+        background: Background colour, 0 to 1; None uses white for photos with alpha, otherwise the mean colour at the
             borders of the photos, so that no Gaussians are used for a plain background.
         max_side: Maximum longer side of a photo, pixels; larger photos are downscaled. None keeps their size.
         inverted_masks: True if the object is black in the masks, False if it is white; None determines it from the
             masks, with False as the fallback.
         seed: Seed of the training.
-        device: Warp device; None is the current one.
-        threads: Number of threads; None is the default.
+        device: Warp device; None uses the current one.
+        threads: Number of threads; None uses the default.
         checkpoint: File (.npz) to which the state is written every half minute; it is not removed.
         resume: Continue from ``checkpoint``; on a CPU, equal arguments give equal bits.
         progress: Called after each step with its number and loss.
@@ -217,7 +217,7 @@ def score_photo(
         view: The photo.
         background: Background colour, 0 to 1.
         held_out: True if the photo was not used for training.
-        threads: Number of threads; None is the default.
+        threads: Number of threads; None uses the default.
     """
     picture = render_gaussians(cloud, view.camera, background=background, threads=threads).colour.numpy()
     known = None if view.weight is None else view.weight > 0
