@@ -1,6 +1,6 @@
 """Sub-commands of ``egs-warp``. Each module adds its parser with ``add_parser``; heavy imports happen when it runs.
 
-A command takes flags, writes files and returns an exit status. No other package handles flags.
+Input: command-line flags. Output: files and an exit status. No other package handles flags. Not part of the paper.
 """
 
 GROUPS = {

@@ -281,8 +281,8 @@ def creature_in_cage(
 
 
 def estimated_up(cloud: GaussianCloud, *, advice: str) -> tuple[np.ndarray, str]:
-    """Return the up direction (3,) that a capture's file contains, otherwise an estimate, and a note for the user that
-    ends with ``advice``."""
+    """Return the up direction (3,) of a capture, from its file or else estimated. The second result is a note for the
+    user, which ends with ``advice``."""
     file_up, vertical_axis = (cloud.up, cloud.vertical_axis) if isinstance(cloud, Capture) else (None, None)
     up, reason = guess_up(cloud, file_up, vertical_axis=vertical_axis)
     axis = int(np.argmax(np.abs(up)))
