@@ -10,9 +10,10 @@ _MAX_MESSAGE_LENGTH = 2000
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
-    """Return `` (did you mean 'walk'?)`` for the member of ``names`` that is nearest to the unknown ``name``; an empty
-    text if none is near."""
-    # Ignore case; of members that differ only in case, suggest the first. A known name is misplaced, not misspelt.
+    """Return `` (did you mean 'walk'?)`` with the member of ``names`` that is most similar to the unknown ``name``, or
+    an empty text if none is similar."""
+    # Ignore case; of members that differ only in case, suggest the first. No suggestion for a name that is a member:
+    # it is in the wrong position, not misspelt.
     by_lower = {str(known).lower(): str(known) for known in reversed(list(names))}
     near = difflib.get_close_matches(str(name).lower(), by_lower, n=1) if str(name) not in by_lower.values() else []
     return f" (did you mean {by_lower[near[0]]!r}?)" if near else ""

@@ -30,19 +30,19 @@ Shape: TypeAlias = int | tuple[int, ...]
 T = TypeVar("T")
 U = TypeVar("U")
 Device: TypeAlias = wp.Device | str | None
-"""A device or its name; None is Warp's current one."""
+"""A device or its name; None stands for Warp's current device."""
 
 THREADS = "EGS_WARP_THREADS"
 """Environment variable with the maximum number of cores that the package uses."""
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 _MIN_ROWS_PER_CHUNK = 2048
-"""Minimum number of light rows per chunk; below it the cost of a launch (about 20 us) is not negligible."""
+"""Minimum number of cheap rows per chunk; in smaller chunks the cost of a launch (about 20 us) is not negligible."""
 
 _ALIGNMENT = 256
-"""Alignment of pooled arrays, bytes: that of the widest loads of a GPU."""
+"""Alignment of pooled arrays, bytes: a multiple of the width of a GPU's widest load."""
 
 _LAST_CHUNKS_PER_THREAD = 24
-"""Ratio of a thread's share to the smallest chunk, which bounds the idle time of a thread at the end."""
+"""Ratio of the rows per thread to the smallest chunk: it bounds the time that a thread is idle at the end."""
 
 
 def available_threads() -> int:
@@ -150,7 +150,7 @@ def launch_rows(
         outputs: outputs.
         device: device of the launch.
         threads: number of threads on a CPU; default: the available cores.
-        work: (row_count,) expected effort of heavy rows in any unit; without it rows count as light and equal.
+        work: (row_count,) expected cost of expensive rows, in any unit; None means that all rows are equally cheap.
     """
     if not device.is_cpu:
         launch_cached(kernel, row_count, inputs=[0, *inputs], outputs=outputs, device=device)
@@ -188,7 +188,7 @@ def launch_rows(
 
 
 class _LaunchCache(threading.local):
-    """Recorded launches of this thread, which are updated and repeated."""
+    """Launches that the current thread has recorded, to be repeated with new arguments."""
 
     def __init__(self) -> None:
         self.launches: dict[tuple[Any, str], tuple[Any, int | tuple[int, ...], list[Any]]] = {}
@@ -239,7 +239,7 @@ def launch_cached(
 
 
 def lanes_on(device: wp.Device) -> int:
-    """Return the number of threads that compute a row together: those of a warp on a GPU, one on a CPU."""
+    """Return the number of threads that compute a row together: 32 (a warp) on a GPU, one on a CPU."""
     return 1 if device.is_cpu else 32
 
 
@@ -248,7 +248,7 @@ _UNKNOWN = object()
 
 
 def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[int]:
-    """Return the boundaries of the chunks; their effort shrinks towards the end, so that threads finish together."""
+    """Return the boundaries of the chunks, whose cost shrinks towards the end, so that threads finish together."""
     min_share = 0.0 if work is not None else _MIN_ROWS_PER_CHUNK / max(row_count, 1)
     min_share = max(min_share, 1.0 / (_LAST_CHUNKS_PER_THREAD * threads))
     shares, total = [], 0.0
@@ -299,14 +299,14 @@ def run_concurrently(first: Callable[[], T], second: Callable[[], U]) -> tuple[T
 def warp_stream(stream: Any) -> wp.Stream:
     """Return Warp's wrapper of a PyTorch ``stream``, cached forever.
 
-    PyTorch has few streams and never frees them. When a wrapper is freed, Warp frees what it holds for the stream, even
-    if another wrapper of it exists.
+    PyTorch has few streams and never frees them. When a wrapper is freed, Warp frees its resources of the stream, even
+    if the stream has another wrapper.
     """
     return wp.stream_from_torch(stream)
 
 
 def device_of(array: wp.array) -> wp.Device:
-    """Return the device of ``array``; Warp declares that it may be None, but it is None only in annotations."""
+    """Return the device of ``array``. Warp's type allows None, which occurs only for arrays in annotations."""
     device: Any = array.device
     return device
 
@@ -322,9 +322,9 @@ def empty(shape: Shape, dtype: Any, device: Device, *, pinned: bool = False) -> 
 def empty_pooled(device: Device, *specs: tuple[Shape, Any]) -> list[wp.array]:
     """Return uninitialized arrays that share one allocation, each specified by its shape and type.
 
-    An allocation on a GPU is expensive compared to rendering a small image. Arrays without remaining references are
-    therefore reused by the next call with the same ``specs`` on the same stream. Allocate arrays of equal lifetime
-    together: the memory is freed with the last of them.
+    An allocation on a GPU is expensive compared to rendering a small image. The next call with the same ``specs`` on
+    the same stream therefore reuses arrays without remaining references. Allocate arrays of equal lifetime together:
+    the memory is freed with the last of them.
     """
     device = wp.get_device(device)
     cache = _free_list.entries
@@ -341,7 +341,7 @@ def empty_pooled(device: Device, *specs: tuple[Shape, Any]) -> list[wp.array]:
         total += -(-count * wp.types.type_size_in_bytes(dtype) // _ALIGNMENT) * _ALIGNMENT
     if device.is_cuda:
         _raise_release_threshold(device.alias)
-    # Two-dimensional, since no dimension of an array may have 2^31 entries.
+    # Two-dimensional, because the length of a dimension must be below 2^31.
     memory = empty((max(total // _ALIGNMENT, 1), _ALIGNMENT), wp.uint8, device)
     arrays = []
     for (shape, dtype), start in zip(specs, starts, strict=True):
@@ -379,13 +379,13 @@ def _max_references(arrays: list[wp.array]) -> int:
 
 
 _UNREFERENCED = max(map(sys.getrefcount, [object()]))
-"""Result of ``_max_references`` for objects that only one list refers to."""
+"""Result of ``_max_references`` for arrays to which nothing but the list refers."""
 _MAX_POOLED_BYTES, _MAX_POOLED_KEYS, _MAX_POOLED_GROUPS = 2**25, 16, 4
 """Maximum size of a reusable allocation, bytes; number of different specifications; allocations per specification."""
 
 
 class _FreeList(threading.local):
-    """Reusable allocations of this thread from ``empty_pooled``, least recently used first."""
+    """Allocations of ``empty_pooled`` that the current thread can reuse, least recently used first."""
 
     def __init__(self) -> None:
         self.entries: OrderedDict[Any, list[list[wp.array]]] = OrderedDict()

@@ -1,4 +1,4 @@
-"""Number types in kernels: Gaussians use float32 (Warp's ``vec3``, ``mat33``), mechanics the float64 types here."""
+"""Float64 types for kernels of mechanics; kernels for Gaussians use Warp's float32 types (``vec3``, ``mat33``)."""
 
 import warp as wp
 

@@ -1,6 +1,6 @@
 """Worker threads for short, frequent tasks.
 
-A KeyboardInterrupt in the caller never leaves a lock acquired that a worker needs for its next task.
+A KeyboardInterrupt in the caller cannot block the workers: no lock that they need for their next tasks stays acquired.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
 _MAX_EXIT_TIME = 10.0
-"""Maximum time that the exit of the process waits for running tasks, s."""
+"""Maximum time for which the process waits for running tasks when it exits, s."""
 
 
 class Task(Generic[T]):
@@ -25,8 +25,8 @@ class Task(Generic[T]):
 
     def __init__(self, work: Callable[[], T]) -> None:
         self._work = work
-        # Plain locks: a KeyboardInterrupt between any two lines can leave a lock of this task acquired, on which no
-        # thread blocks any more, but never a lock that a worker needs for the next task.
+        # Plain locks: a KeyboardInterrupt between any two lines can leave a lock of this task acquired. No thread
+        # blocks on such a lock afterwards, and workers do not need it for other tasks.
         self._started, self._done = threading.Lock(), threading.Lock()
         self._done.acquire()
         self._result: Any = None
@@ -64,7 +64,7 @@ class Task(Generic[T]):
 
 
 class WorkerThreads:
-    """Pool of at most ``max_threads`` threads, which start one by one with the first tasks.
+    """Pool of at most ``max_threads`` threads, which are started on demand.
 
     ``ThreadPoolExecutor`` is not used: a KeyboardInterrupt within its ``submit`` can leave a lock acquired, on
     which its threads, and therefore the exit of the process, would block.
@@ -72,7 +72,7 @@ class WorkerThreads:
 
     def __init__(self, max_threads: int) -> None:
         self._max_threads = max_threads
-        # Implemented in C, so that an interrupt cannot leave it in an inconsistent state.
+        # ``SimpleQueue`` is implemented in C, so an interrupt cannot leave it in an inconsistent state.
         self._tasks: SimpleQueue[Task[Any] | None] = SimpleQueue()
         self._threads: list[threading.Thread] = []
 
@@ -89,7 +89,7 @@ class WorkerThreads:
         return task
 
     def end(self) -> None:
-        """Stop the workers after their current tasks, and wait for them."""
+        """Stop the workers after their current tasks, and wait for them for at most ``_MAX_EXIT_TIME``."""
         for _ in self._threads:
             self._tasks.put(None)
         deadline = time.monotonic() + _MAX_EXIT_TIME
@@ -105,7 +105,7 @@ class WorkerThreads:
 
 @cache
 def worker_threads() -> WorkerThreads:
-    """Return the worker threads of this process: one per core except one, but at least one."""
+    """Return the worker threads of this process: one fewer than the cores of the machine, but at least one."""
     workers = WorkerThreads(max(1, (os.cpu_count() or 1) - 1))
     # Compiled code must not be unloaded while a worker runs it.
     atexit.register(workers.end)

@@ -43,9 +43,9 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.report import Report
 
 EXIT_NOT_AS_REQUESTED = 3
-"""Exit status of a run that has written its files, but is not what was requested (``State.is_failure``)."""
+"""Exit status of a run that has written its files but did not achieve the requested motion (``State.is_failure``)."""
 _WRITES = (NAME, "trajectory.npz", "plots.png", "cage.vtu", "sheet.png", "creature.npz", "report.json")
-"""Files that every run writes. The names of further files depend on the motion."""
+"""Files that every run writes. The names of other files depend on the motion."""
 EXAMPLES = (
     "pawn.ply --up z --out out/jump",
     'scan.spz --motion "hop x3, twist 180" --camera follow --size 1280x720 --out out/hop',
@@ -217,7 +217,7 @@ def run_animate(args: argparse.Namespace) -> int:
     try:
         report = _animate_scene(args) if args.object is not None else _animate_capture(args)
     except BaseException as error:
-        # With --overwrite the folder may still contain the earlier run, which cannot be resumed as this one.
+        # With --overwrite, the folder may still contain the earlier run, which must not be resumed as this run.
         if not args.overwrite and (args.out / NAME).is_file():
             error.add_note(f"egs-warp resume {args.out} continues it")
         raise
@@ -260,7 +260,7 @@ def _animate_capture(args: argparse.Namespace) -> Report:
 
 
 def _animate_scene(args: argparse.Namespace) -> Report:
-    """Animate an object segmented from a scene, with the rest of the scene as background; see ``_animate_capture``."""
+    """Animate an object that is segmented from a scene, with the rest of the scene as background."""
     from egs_warp.commands.scene_input import read_scene
     from egs_warp.io.run_folder import run_folder
     from egs_warp.io.video import ffmpeg_program
@@ -290,7 +290,7 @@ def _animate_scene(args: argparse.Namespace) -> Report:
     with run_folder(args.out, overwrite=args.overwrite, resume=args.resume) as run:
         run.begin_with(lambda: write_config(run.file(NAME), args, args.parser))
         scene = scene_input.prepared(scene_options)
-        # Written first: a later error must not lose minutes of work.
+        # Write the scene first, so that a later error does not lose minutes of work.
         scene.write(run)
         _write_pictures(run, scene_input, scene)
         for note in (*scene_input.notes, *scene.notes):
@@ -327,7 +327,7 @@ def _animate_whole(
     plane: Plane | None,
     background: GaussianCloud | None = None,
 ) -> Report:
-    """Animate ``cloud``, which is one object; see ``_animate_capture``."""
+    """Animate ``cloud``, which contains only the object."""
     from egs_warp.io.run_folder import run_folder
     from egs_warp.pipelines.animate import animate
 
@@ -350,7 +350,7 @@ def _animate_whole(
 
 
 def _write_pictures(run: RunFolder, scene_input: SceneInput, scene: PreparedScene) -> None:
-    """Write the images by which the user checks each step, as ``plane``, ``segment`` and ``inpaint`` write them."""
+    """Write the images for checking each stage that the commands ``plane``, ``segment`` and ``inpaint`` also write."""
     from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
@@ -374,7 +374,7 @@ def _write_pictures(run: RunFolder, scene_input: SceneInput, scene: PreparedScen
 
 
 def animate_options(args: argparse.Namespace) -> AnimateOptions:
-    """Return the options that the flags define without the capture. Raises ``UserError`` for invalid flags."""
+    """Return the options that depend only on the flags, not on the capture. Raises ``UserError`` for invalid flags."""
     from egs_warp.contact.terrain import read_terrain
     from egs_warp.io.text import parse_json, read_text
     from egs_warp.locomotion.settings import LocomotionSettings

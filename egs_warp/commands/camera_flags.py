@@ -25,7 +25,7 @@ def add_camera_flags(
 
     Args:
         parser: parser or group that gets the flags.
-        size: the video size without ``--size``, for the help.
+        size: the default video size, for the help.
         common: parser or group that gets ``--camera`` and ``--size``; default ``parser``.
     """
     first = common or parser
@@ -71,8 +71,8 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_colour(text: str) -> tuple[float, float, float] | None:
-    """Return (r, g, b), each 0 to 1, from ``r,g,b``, ``#rrggbb`` or the name of a CSS colour that is not a file; None
-    for other texts.
+    """Return (r, g, b), each 0 to 1, from ``r,g,b``, ``#rrggbb`` or the name of a CSS colour; None for other texts and
+    for a colour name that is also the name of a file.
 
     Raises ``UserError`` for numbers outside the range 0 to 1.
     """

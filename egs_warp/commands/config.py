@@ -25,7 +25,7 @@ _PATHS = (
 _WORDS = ("auto", "fixed", "follow", "orbit", "patch", "telea", "ns", TRANSPARENT)
 """Values of these flags that do not name files."""
 _IN_MOTION = re.compile(r"\S+\.(?:json|csv)", re.IGNORECASE)
-"""File names within ``--motion``."""
+"""Pattern of file names in the value of ``--motion``."""
 _NEVER = ("help", "out", "overwrite", "config", "trust")
 """Flags that the file does not store: each run has its own output folder, and only the user may set ``--trust``."""
 
@@ -40,7 +40,7 @@ def add_config_flag(parser: argparse._ActionsContainer) -> None:
 
 
 def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> list[str]:
-    """Return ``arguments`` of ``parser`` preceded by those of the file that ``--config`` names, if any.
+    """Return ``arguments`` of ``parser``, preceded by the arguments in the file of ``--config``, if any.
 
     Raises ``UserError`` for an unreadable file, unknown keys, and values that are not a text, number or boolean.
     """
@@ -48,7 +48,7 @@ def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> li
     config_parser.add_argument("--config")
     try:
         named, rest = config_parser.parse_known_args(list(arguments))
-    # The parser of the command reports the error.
+    # The parser of the command reports this error.
     except argparse.ArgumentError:
         return list(arguments)
     if named.config is None:
@@ -70,7 +70,7 @@ def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> li
             option, texts = action.option_strings[0], value if isinstance(value, list) else [value]
             if not all(isinstance(one, str | int | float) for one in texts):
                 raise UserError(f"{path}: {key} is {_short(value)}; give a text or a list of texts")
-            # The command line replaces all values of the file: argparse would append to them.
+            # Values on the command line replace the values of the file, to which argparse would append them.
             if not any(argument == option or argument.startswith(f"{option}=") for argument in rest):
                 flags += [f"{option}={_from_file(name, str(one), path.parent)}" for one in texts]
             continue
@@ -82,7 +82,7 @@ def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> li
             positional.append(text)
         else:
             flags.append(action.option_strings[0] if value is True else f"{action.option_strings[0]}={text}")
-    # A capture on the command line replaces that of the file; argparse would reject two.
+    # A capture on the command line replaces the capture in the file; argparse would reject two captures.
     surplus = parser.parse_known_args([*positional, *flags, *rest, "--out=x"])[1] if positional else []
     if any(not argument.startswith("-") for argument in surplus):
         positional = []
@@ -90,7 +90,7 @@ def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> li
 
 
 def changed_capture(config: str, capture: str) -> bool:
-    """Return True if the checksum of ``capture`` differs from that in the file ``config``; False if it has none."""
+    """Return True if the checksum of ``capture`` differs from the one in the file ``config``; False without one."""
     expected = _read(Path(config)).get(_CHECKSUM)
     return expected is not None and expected != _checksum(Path(capture))
 
@@ -128,7 +128,7 @@ def _read(path: Path) -> dict[Any, Any]:
     from egs_warp.io.text import read_text
 
     class Plain(yaml.SafeLoader):
-        """YAML loader without aliases: a few lines of nested aliases can expand beyond the memory of any machine."""
+        """YAML loader without aliases, because a few lines of nested aliases can expand beyond the available memory."""
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):

@@ -90,7 +90,7 @@ def _convert_files(args: argparse.Namespace, stack: ExitStack) -> int:
         raise missing_error(first)
     if args.to is None or first.is_file() or len(args.captures) > 1:
         write = writer_of(args.out, kind=args.to)
-        # Checked before a capture is read, which may take long.
+        # Check this before a capture is read, which may take long.
         if not args.out.absolute().parent.is_dir():
             raise UserError(f"{args.out}: its folder does not exist; create {args.out.parent} first")
         if args.out.exists() and any(source.exists() and args.out.samefile(source) for source in args.captures):
@@ -122,7 +122,7 @@ def _convert_files(args: argparse.Namespace, stack: ExitStack) -> int:
                 origin = write.stored_origin(capture.origin)
                 lines = [*changes, *conversion_loss(capture, read_capture(target), order, origin=origin)]
     for note, noted in sources_of.items():
-        # Notes of merged captures name their files.
+        # The notes of merged captures already name their files.
         name = "" if len(args.captures) > 1 else f"{noted[0]}: "
         others = f" (and {len(noted) - 1} more of the files)" if len(noted) > 1 else ""
         print_note(f"{name}{note}{others}")

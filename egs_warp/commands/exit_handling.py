@@ -20,9 +20,9 @@ from egs_warp.commands.flags import flag_of
 from egs_warp.errors import UserError
 
 _EXHAUSTED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
-"""Error numbers of an exhausted or failing machine; the input is not the cause."""
+"""Error numbers that are caused by exhausted resources or failing hardware, not by the input."""
 _NOT_PERMITTED = (errno.EROFS, errno.EACCES, errno.EPERM)
-"""Error numbers of paths that the user may not read or write. Other errors are bugs and keep their traceback."""
+"""Error numbers of paths without permission to read or write. Other errors are bugs and keep their traceback."""
 
 _RESEND_DELAY = 0.05
 """Delay after which a signal whose exception was dropped is sent again, s."""
@@ -40,9 +40,9 @@ class _TerminatedError(BaseException):
 def one_line_errors(program: str) -> Iterator[None]:
     """Context manager that turns errors and signals into one line on stderr and an exit status.
 
-    Invalid input gives status 2, or 1 if an exhausted machine has caused it; the message names flags. The first Ctrl-C
-    or SIGTERM unwinds the stack, a second one ends the process at once. A closed pipe only silences the output. See
-    ``docs/reliability.md``.
+    A ``UserError`` gives status 2, or 1 if its cause is exhausted memory or disk space; the message names flags. The
+    first Ctrl-C or SIGTERM unwinds the stack, a second one ends the process at once. A closed pipe only silences the
+    output. See ``docs/reliability.md``.
 
     Args:
         program: name at the beginning of the line.
@@ -94,12 +94,12 @@ def _noted(line: str, error: BaseException) -> str:
 def _unwinding(raised: list[type[BaseException]]) -> Iterator[None]:
     """Raise the exception of a signal again if a C extension has replaced it.
 
-    An extension that is interrupted during its import raises its own error ("initialization failed").
+    An extension whose import is interrupted raises its own error ("initialization failed").
     """
     try:
         yield
     except (ImportError, SystemError) as error:
-        # Only these errors: other errors after a Ctrl-C, for example one that ended a server, keep their own line.
+        # Replace only these errors. Other errors after a Ctrl-C, such as one that has ended a server, keep their line.
         if raised:
             raise raised[0] from error
         raise
@@ -107,7 +107,7 @@ def _unwinding(raised: list[type[BaseException]]) -> Iterator[None]:
 
 @contextmanager
 def _signals() -> Iterator[list[type[BaseException]]]:
-    """Raise an exception on the first Ctrl-C or SIGTERM; yields the list of exceptions that were raised."""
+    """Raise an exception on the first Ctrl-C or SIGTERM; yield the list of the raised exceptions' types."""
     raised: list[type[BaseException]] = []
     if threading.current_thread() is not threading.main_thread():
         yield raised
@@ -186,7 +186,7 @@ class _Stream:
         try:
             return self._stream.write(text)
         except UnicodeEncodeError as error:
-            # The encoding lacks a character, for example of a folder's name; this must not end hours of work.
+            # A character that the encoding lacks, for example in a folder's name, must not end hours of work.
             return self._stream.write(text.encode(error.encoding, "backslashreplace").decode(error.encoding))
         except self._ignored:
             self._silence()
@@ -207,7 +207,7 @@ class _Stream:
             self._silence()
 
     def _silence(self) -> None:
-        # Redirect to the null device: the buffered output is dropped now and when Python exits.
+        # Redirect to the null device, so that buffered output is dropped now and when Python exits.
         with contextlib.suppress(OSError, ValueError):
             null = os.open(os.devnull, os.O_WRONLY)
             os.dup2(null, self._stream.fileno())

@@ -1,4 +1,4 @@
-"""Flags shared by several commands: their parsing, and the library argument that each one sets."""
+"""Flags shared by several commands: their parsing, and the library arguments that they set."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from egs_warp.inpainting.inpainters import Inpainter
 
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
-"""Subparsers that a command adds its parser to."""
+"""Subparsers, to which each command adds its parser."""
 
 SPLAT_FILES = ("ply", "compressed-ply", "spz", "spz4", "sog", "splat", "glb")
 """Keys of ``egs_warp.io.writing.WRITERS``, repeated here because that module is slow to import."""
@@ -26,7 +26,7 @@ QP_SOLVERS = ("osqp", "admm", "daqp")
 STRATEGIES = ("modes", "paper")
 """Values of ``egs_warp.locomotion.strategies.Strategy``, repeated here because that module is slow to import."""
 _FLAGS = {"cage_file": "--cage", "muscles_file": "--muscles", "solids": "--terrain"}
-"""Flags whose names differ from their library arguments, by argument."""
+"""Map from library arguments to flags, for flags with another name."""
 
 
 def flag_of(argument: str) -> str:
@@ -35,7 +35,10 @@ def flag_of(argument: str) -> str:
 
 
 def named_path(text: str) -> Path:
-    """Return ``text`` as a path. Raises ``ArgumentTypeError`` for an empty text, which would be the working folder."""
+    """Return ``text`` as a path.
+
+    Raises ``ArgumentTypeError`` for an empty text, which would otherwise name the working folder.
+    """
     if not text.strip():
         raise argparse.ArgumentTypeError("the name is empty; give a name")
     return Path(text)

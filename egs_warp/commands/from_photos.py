@@ -25,13 +25,13 @@ EXAMPLES = (
 )
 _POSE, _TRAIN, _PICK, _FILM = "pose", "train", "pick", "film"
 _POSED, _CAPTURE, _PICKED = "posed", "capture.ply", "picked.json"
-"""Names in the folder: posed photos, capture and picked object. The film is in a folder with the name of its stage."""
+"""Names in the output folder: posed photos, capture and picked object. The film has a folder named after its stage."""
 _BARS = {_POSE: ("pose",), _TRAIN: ("train",), _PICK: ("pick",), _FILM: ("scene", "prepare", "simulate", "render")}
-"""Stages of the progress line, by stage of the command."""
+"""Stages of the progress bar for each stage of the command."""
 _TRAIN_FLAGS = ("iterations", "gaussians")
 _PICK_FLAGS = ("up", "mask_model", "view")
 _POSE_FILES = (".json", ".csv", ".xml")
-"""Endings of files with camera poses; all other files are captures."""
+"""Endings of files with camera poses; other files are videos or captures."""
 
 
 def add_parser(commands: Commands) -> None:
@@ -69,7 +69,7 @@ class _Source:
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """Stages that lead from it to a film."""
+        """Stages that lead from this input to a film."""
         if self.photos is not None:
             return (_POSE, _TRAIN, _PICK, _FILM)
         return (_TRAIN, _PICK, _FILM) if self.capture is None else (_PICK, _FILM)
@@ -90,7 +90,7 @@ def _from_photos(args: argparse.Namespace) -> int:
             try:
                 status = run.all_stages(source)
             except BaseException as error:
-                # Signals, not errors, whose message says what to change.
+                # Only for signals: the message of an error says what to change.
                 if not isinstance(error, Exception):
                     error.add_note("repeat the command to continue")
                 raise
@@ -99,7 +99,8 @@ def _from_photos(args: argparse.Namespace) -> int:
 
 
 def _source(args: argparse.Namespace) -> _Source:
-    """Return what the argument is. Raises ``UserError`` if it is missing, or does not match ``--cameras``."""
+    """Return the input that the argument names. Raises ``UserError`` if it does not exist or does not match
+    ``--cameras``."""
     from egs_warp.io.frames import VIDEO_SUFFIXES
     from egs_warp.io.pose_files import find_poses
 
@@ -124,7 +125,7 @@ def _source(args: argparse.Namespace) -> _Source:
 
 
 def _check(args: argparse.Namespace, source: _Source) -> None:
-    """Raise the ``UserError`` that a later stage would raise for the flags, before any long work."""
+    """Raise the ``UserError`` that a later stage would raise for the flags, before any long computation."""
     from egs_warp.commands.animate import animate_options
     from egs_warp.io import read_cameras
     from egs_warp.io.run_folder import check_out
@@ -191,8 +192,8 @@ class _Run:
     def _stage(
         self, stage: str, options: Mapping[str, Any], inputs: Sequence[Path], files: Callable[[], Sequence[Path]]
     ) -> Iterator[StageState | None]:
-        """Yield the state of ``stage``, or None if it has finished; record that it begins, and the ``files`` that it
-        has written at its end."""
+        """Yield the state of ``stage``, or None if it has finished. Record its start, and at its end the ``files`` that
+        it has written."""
         from egs_warp.io.stage_record import StageState, stage_key
 
         self._bar.update(_BARS[stage][0])
@@ -266,13 +267,13 @@ class _Run:
         words += [*(f"--object={value}" for value in args.object or ()), *(["--no-browser"] if args.no_browser else [])]
         pick = args.parsers["pick"].parse_args([*words, *([] if posed is None else [f"--cameras={posed}"])])
         options = {name: str(getattr(args, name)) for name in (*_PICK_FLAGS, "object")}
-        # The user may correct the file later: its content belongs to the inputs of the film, not to this record.
+        # The user may correct the file later. Therefore it is recorded as an input of the film, not as an output here.
         with self._stage(_PICK, options, [capture], list) as state:
             if state is None and picked.is_file():
                 return
             if state is not StageState.INTERRUPTED:
                 back_up(self._folder, [_PICKED])
-            # An interrupted run may have written the file, with what the user has picked on the page.
+            # An interrupted run may have written the file with the object that the user has picked.
             if args.yes and not picked.is_file():
                 pick_automatically(pick)
             elif args.yes:
@@ -294,7 +295,7 @@ class _Run:
             if state is None:
                 return status_of_finished(film)
             if state is StageState.INTERRUPTED:
-                # A run of another version cannot be resumed, and is made again.
+                # A run of another version cannot be resumed and is simulated again.
                 with suppress(UserError):
                     if has_finished(film):
                         return status_of_finished(film)

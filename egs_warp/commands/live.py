@@ -121,7 +121,7 @@ class _Source:
     """A capture with its ground, and the object in it."""
 
     cloud: GaussianCloud
-    """The object, or the whole capture until ``prepared``."""
+    """The object; before ``prepared``, the whole capture."""
     up: np.ndarray | None
     plane: Plane | None
     front: np.ndarray | None
@@ -130,10 +130,10 @@ class _Source:
     scene: SceneInput | None = None
     """Scene of the object; None if the capture is the object."""
     light: MainLight | None = None
-    """Main light, in the axes of the capture; None if it is not clear."""
+    """Main light in the axes of the capture; None if its estimate is uncertain."""
 
     def prepared(self, begin_stage: Callable[[str], object]) -> _Source:
-        """Return the object, separated from its scene."""
+        """Return the source with the object separated from its scene."""
         from egs_warp.pipelines.prepare_scene import SceneOptions
 
         if self.scene is None or self.scene.is_object_alone:
@@ -190,7 +190,7 @@ def wait_for_end(thread: threading.Thread) -> None:
 
 
 def _session(args: argparse.Namespace, source: _Source, *, begin_stage: Callable[[str], object]) -> Session:
-    """Build the creature of ``source`` and return a session that is not started."""
+    """Build the creature of ``source`` and return a session that has not been started."""
     from egs_warp.locomotion.settings import LocomotionSettings
     from egs_warp.pipelines.creature import CreatureOptions, make_creature
     from egs_warp.pipelines.progress import preparation_bar

@@ -23,7 +23,7 @@ from egs_warp.segmentation.propagated_masks import masks_of_clicks, salient_mask
 from egs_warp.segmentation.votes import MaskedView
 
 MAX_MASK_SIDE = 800
-"""Maximum side of a mask, pixels; larger masks are reduced to a half, a third, ... of their size."""
+"""Maximum side of a mask, pixels; larger masks are downscaled by a whole factor."""
 _HELP = (
     "give a mask.png, a folder of masks, a picked.json, a point x,y,z, a box x0,y0,z0,x1,y1,z1, a pixel u,v with "
     "--view, or clicks +u,v@photo on the object and -u,v@photo next to it"
@@ -33,9 +33,9 @@ _MAX_DIGITS = 10
 _SALIENT = "salient"
 """Value that selects the salient object of each photo."""
 _CLICK = re.compile(r"([+-]?)([0-9.]+),([0-9.]+)@(.+)", re.DOTALL)
-"""A click: sign, u, v and photo."""
+"""Pattern of a click: sign, u, v and photo."""
 _PICKED = re.compile(r"(.+\.json)(?::(.+))?", re.DOTALL | re.IGNORECASE)
-"""A file of ``egs-warp pick`` and, optionally, the name of an object in it."""
+"""Pattern of a file of ``egs-warp pick`` and, optionally, the name of an object in it."""
 
 
 def read_object(
@@ -95,7 +95,7 @@ def read_object(
 def picked_object(texts: Sequence[str], cloud: GaussianCloud) -> PickedObject | None:
     """Return the object of the value ``picked.json`` or ``picked.json:NAME``; None for other values of ``--object``.
 
-    Raises ``UserError`` for a damaged file, an unknown name, and further values.
+    Raises ``UserError`` for a damaged file, an unknown name, and other values in addition.
     """
     for text in texts:
         match = _PICKED.fullmatch(text)
@@ -111,7 +111,7 @@ def _path_exists(text: str) -> bool:
     """Return True if ``text`` is the path of an existing file or folder."""
     try:
         return Path(text).exists()
-    # The name is too long for a path.
+    # Raised if the text is too long for a path.
     except OSError:
         return False
 
@@ -183,7 +183,7 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str) -> Pos
         if len(posed) == 1:
             return posed[0]
         raise UserError(f"--object {what}: {len(posed)} cameras; choose one with --view NAME or NUMBER")
-    # isdecimal excludes superscript digits, and the limit numbers of thousands of digits; int() rejects both.
+    # int() fails for superscript digits, which isdecimal excludes, and for thousands of digits, hence the limit.
     if view.isdecimal() and len(view) < _MAX_DIGITS and int(view) < len(posed):
         return posed[int(view)]
     for one in posed:
@@ -208,7 +208,7 @@ def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None
         one = _camera_of(file, posed, view if len(files) == 1 else None)
         camera = one.camera
         size = mask_size(file)
-        # Checked before decoding: a small file can contain a very large image.
+        # Check the size before decoding, because a small file can contain a very large image.
         if size != (camera.width, camera.height):
             raise UserError(
                 f"{file}: the mask is {size[0]} x {size[1]} pixels, the photo {one.name} "
@@ -220,14 +220,15 @@ def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None
             mask = Undistortion.of(camera, one.lens).mask(mask)
         small = downscale(camera, MAX_MASK_SIDE)
         factor = camera.width // small.width
-        # Take the middle pixel of each block; the edges of masks are no more accurate than that.
+        # Take the middle pixel of each block, which is as accurate as the edges of masks are.
         mask = mask[factor // 2 :: factor, factor // 2 :: factor][: small.height, : small.width]
         masks.append(MaskedView(small, mask, str(file)))
     return masks
 
 
 def _camera_of(file: Path, posed: Sequence[PosedImage], view: str | None) -> PosedImage:
-    """Return the camera of a mask file: ``view``, otherwise that of the photo with a matching name or the only one."""
+    """Return the camera of a mask file: ``view`` if given, otherwise the camera of the photo with a matching name, or
+    the only camera."""
     if view is not None:
         return _view_named(posed, view, str(file))
     stems = [(Path(one.name).stem, one) for one in posed]
@@ -267,7 +268,7 @@ def read_mask(path: Path) -> np.ndarray:
         with Image.open(path) as opened:
             picture = opened if opened.mode in ("P", "1", "L", "I", "I;16", "F") else opened.convert("RGBA")
             values = np.array(picture)
-    # The decoder reads untrusted bytes, and its errors share no base class.
+    # The decoder reads untrusted bytes, and its errors have no common base class.
     except Exception as error:
         raise UserError(f"{path}: not a readable picture; give a mask as PNG") from error
     if values.ndim == 3:

@@ -28,9 +28,10 @@ EXAMPLES = (
     "room.ply --object 0,0,0.5",
 )
 _LAST_LINE = 1.0
-"""Time for which the page can receive its last line, s."""
+"""Time for which the server continues, so that the page receives its last line, s."""
 _DISTANCE = 1.25
-"""Distance of the initial camera relative to that of a preview, which leaves space for the arrows."""
+"""Ratio of the distance of the initial camera to the distance for a preview; above 1, it leaves space for the
+arrows."""
 
 
 def add_parser(commands: Commands) -> None:
@@ -64,11 +65,11 @@ def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
 
     Args:
         args: the flags of ``egs-warp pick``.
-        film: motion of the film that the caller makes after the page; None if the page itself starts commands until
-            Ctrl-C.
+        film: motion of the film that the caller renders after the page has ended; None if the page itself starts
+            commands, until Ctrl-C.
 
     Returns:
-        True if the user has requested the film, so that ``args.out`` is written; False if the server has ended.
+        True if the user has requested the film, for which ``args.out`` has been written; False if the server has ended.
     """
     import webbrowser
 
@@ -135,7 +136,7 @@ def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
 
 
 def pick_automatically(args: argparse.Namespace) -> None:
-    """Write ``args.out`` with the object of ``--object``, or with the first proposal of the page.
+    """Write ``args.out`` with the object of ``--object``, or with the object that the page would propose first.
 
     Raises ``UserError`` if there is no object in the middle of the capture.
     """
@@ -166,7 +167,8 @@ def pick_automatically(args: argparse.Namespace) -> None:
 
 
 def _up_of(scene: SceneInput) -> np.ndarray:
-    """Return the up direction (3,) of ``--up``, of the capture's file, of the cameras, or estimated from its shape."""
+    """Return the up direction (3,) from the first of these that defines it: ``--up``, the capture's file, the cameras,
+    the shape of the capture."""
     from egs_warp.io import Capture
     from egs_warp.pipelines.locate_plane import up_of_cameras
 
@@ -180,7 +182,7 @@ def _up_of(scene: SceneInput) -> np.ndarray:
 
 
 def _given_object(scene: SceneInput) -> PickedObject:
-    """Return the object of ``--object`` and the plane under it, as the other commands find them."""
+    """Return the object of ``--object`` and the plane under it, found as in the other commands."""
     from egs_warp.io.picked import PickedObject
     from egs_warp.pipelines.locate_plane import locate_plane
 
@@ -190,7 +192,7 @@ def _given_object(scene: SceneInput) -> PickedObject:
 
 @dataclass(frozen=True)
 class _Commands:
-    """``PickCommands`` with the capture, cameras and device of ``args``."""
+    """Implementation of ``PickCommands`` with the capture, cameras and device of ``args``."""
 
     args: argparse.Namespace
 

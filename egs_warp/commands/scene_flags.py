@@ -33,14 +33,14 @@ def add_object_flags(parser: argparse._ActionsContainer, *, common: argparse._Ac
 
 
 def check_no_scene_flags(args: argparse.Namespace) -> None:
-    """Raise ``UserError`` for flags that need ``--object``, which is missing."""
+    """Raise ``UserError`` for flags that require ``--object`` if it is missing."""
     for name in ("cameras", "view", "mask_model", "straddling", "inpainter", "trust", "no_inpaint"):
         if getattr(args, name, None) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: needs --object, which selects the object of a scene")
 
 
 def add_flat_flag(parser: argparse._ActionsContainer) -> None:
-    """Add the flag that replaces uneven ground by its plane."""
+    """Add the flag that replaces uneven ground with its plane."""
     parser.add_argument(
         "--flat", action="store_true", help="use the plane as the ground, even if the captured ground is uneven"
     )

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions
 
 _SOLID, _MAX_REST = 0.3, 0.02
-"""Opacity of a Gaussian that counts, and the share of such Gaussians outside of an object below which the object is the
-whole capture."""
+"""Minimum opacity of a Gaussian to be considered, and maximum share of these Gaussians outside an object for the object
+to be the whole capture."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class SceneInput:
     """Scene with the user's selections, in scene units."""
 
     cloud: GaussianCloud
-    """The whole scene, with the facts of its file (``Capture``)."""
+    """The whole scene, with the metadata of its file (``Capture``)."""
     posed: Sequence[PosedImage]
     """Cameras of ``--cameras`` with their photos; empty without that flag."""
     spec: ObjectSpec | None
@@ -47,7 +47,7 @@ class SceneInput:
     plane: Plane | None
     """Plane of ``--plane``, or of a picked object; None to estimate it."""
     notes: tuple[str, ...]
-    """Notes of the reader for the user."""
+    """Notes for the user from reading the files."""
     front: np.ndarray | None = None
     """(3,) facing direction of a picked object; None to estimate it."""
 
@@ -60,7 +60,7 @@ class SceneInput:
 
     @property
     def is_object_alone(self) -> bool:
-        """True if a picked object is nearly the whole capture: there is no scene from which to separate it."""
+        """True if a picked object is nearly the whole capture, so that there is no scene from which to separate it."""
         if self.spec is None or self.spec.picked is None:
             return False
         solid = self.cloud.opacities() > _SOLID
@@ -68,17 +68,17 @@ class SceneInput:
 
     @property
     def cameras(self) -> list[Camera]:
-        """Cameras without their photos."""
+        """The cameras of ``posed``, without their photos."""
         return [one.camera for one in self.posed]
 
     def prepared(
         self, options: SceneOptions, *, begin_stage: Callable[[str], object] = lambda stage: None
     ) -> PreparedScene:
-        """Segment the scene with ``prepare_scene`` and show a progress bar; a scene that was prepared before is read
-        from the cache (``egs_warp.pipelines.scene_cache``).
+        """Prepare the scene with ``prepare_scene`` and show a progress bar, or read the result from the cache
+        (``egs_warp.pipelines.scene_cache``).
 
-        Photos next to the cameras, if any, serve for fine-tuning. ``begin_stage`` is called with the name of each stage
-        as it starts.
+        The fine-tuning uses photos next to the cameras, if there are any. ``begin_stage`` is called with the name of
+        each stage as it starts.
         """
         from egs_warp.pipelines.prepare_scene import prepare_scene
         from egs_warp.pipelines.progress import scene_bar

@@ -41,7 +41,7 @@ class ScenePlanes:
 
     @property
     def planes(self) -> list[Plane]:
-        """The planes alone, in the order of ``known``."""
+        """The planes of ``known``, in the same order."""
         return [one.plane for one in self.known]
 
     def write(self, path: Path) -> None:

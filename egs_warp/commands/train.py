@@ -124,7 +124,7 @@ def run_train(
             " again"
         )
     outputs = (args.out, sheet, report_path)
-    # With --resume, existing outputs belong to the interrupted training, or its flags allowed it to move them.
+    # With --resume, existing outputs belong to the interrupted training, or its flags allowed to move them.
     overwrite = args.overwrite or (args.resume and checkpoint.exists())
     check_named_files(*outputs, overwrite=overwrite)
     import warp as wp
@@ -141,7 +141,7 @@ def run_train(
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.train_report import TrainReport
 
-    # Read first: unreadable poses must not leave a new folder.
+    # Read the poses first, so that an error does not leave a new folder.
     read_cameras(args.posed)
     iterations, gaussians, side = _DEFAULTS["cuda" if args.device.startswith("cuda") else "cpu"]
     iterations = args.iterations or iterations
@@ -244,7 +244,7 @@ class _Progress:
 
 
 def _sheet(result: TrainResult) -> np.ndarray:
-    """Return the sheet (H, W, 3), uint8: photos, held-out ones if there are any, next to their renders."""
+    """Return the comparison sheet (H, W, 3) uint8: photos next to their renders; held-out photos if there are any."""
     import numpy as np
 
     from egs_warp.io.video import contact_sheet

@@ -1,4 +1,4 @@
-"""``egs-warp validate``: check that a bundle keeps to its format."""
+"""``egs-warp validate``: check that a bundle conforms to its format."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """Types that all packages share: Gaussian clouds, cameras, planes, tetrahedral meshes, frames (section 3.1).
 
-Input: arrays. Output: frozen records of them, with shapes and units under each field. Nothing here reads a file or
-launches a kernel.
+Input: arrays. Output: frozen records of arrays, with shapes and units under each field. This package reads no files and
+launches no kernels.
 """

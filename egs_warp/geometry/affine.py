@@ -10,7 +10,7 @@ from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
 from egs_warp.launching import device_of, launch_rows
 
 _SIMILAR = 1e-6
-"""Relative difference of the singular values up to which a matrix is a similarity."""
+"""Maximum relative difference of the singular values of a matrix that is considered a similarity."""
 _BLOCK_ROWS = 1 << 18
 
 
@@ -45,14 +45,14 @@ def rotated_colours(sh: wp.array, rotation: Rotation) -> wp.array:
 def transformed_shapes(
     rotations: np.ndarray, log_scales: np.ndarray, matrix: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return quaternions (n, 4) and log scales (n, 3) float32 of the covariances M Sigma M^T, with M the ``matrix``.
+    """Return quaternions (n, 4) and log scales (n, 3) float32 of the covariances M Sigma M^T, where M is ``matrix``.
 
     With the singular value decomposition M R S = U D V^T, U gives the quaternions and D the scales; a similarity only
-    rotates R and scales S. A Gaussian is symmetric, so the sign of an axis is arbitrary, and a reflection is exact.
+    rotates R and scales S. Reflections are represented exactly, because the sign of an axis of a Gaussian is arbitrary.
 
     Args:
         rotations: (n, 4) quaternions w, x, y, z.
-        log_scales: (n, 3).
+        log_scales: (n, 3) logarithms of the standard deviations.
         matrix: (3, 3), not singular.
     """
     sizes = np.linalg.svd(matrix, compute_uv=False)
@@ -82,8 +82,8 @@ def transformed_shapes(
 def transformed_colours(sh: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Return (n, K, 3) float32 SH coefficients of Gaussians transformed by ``matrix`` (3, 3), not singular.
 
-    Colours follow the orthogonal factor Q of its polar decomposition. For a reflection, -Q is a rotation, and the
-    remaining point inversion negates the odd bands.
+    The colours are transformed by the orthogonal factor Q of the polar decomposition of ``matrix``. For a reflection,
+    -Q is a rotation, and the remaining point inversion negates the odd bands.
     """
     first, _, second = np.linalg.svd(matrix)
     orthogonal = first @ second

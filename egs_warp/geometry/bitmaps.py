@@ -9,17 +9,17 @@ from scipy import ndimage
 
 
 def depth_inside(mask: np.ndarray) -> np.ndarray:
-    """(rows, columns) float64, distance of each set pixel to the nearest unset one; 0 for unset pixels."""
+    """Return the distance (rows, columns) float64 of each set pixel to the nearest unset pixel; 0 for unset pixels."""
     return np.asarray(cast(Any, ndimage.distance_transform_edt(mask)))
 
 
 def distance_to(mask: np.ndarray) -> np.ndarray:
-    """(rows, columns) float64, distance of each pixel to the nearest set one."""
+    """Return the distance (rows, columns) float64 of each pixel to the nearest set pixel."""
     return depth_inside(~mask)
 
 
 def nearest_set(mask: np.ndarray) -> np.ndarray:
-    """(2, rows, columns) int, row and column of the set pixel nearest to each pixel."""
+    """Return row and column (2, rows, columns) int of the set pixel nearest to each pixel."""
     result: Any = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
     return np.asarray(result)
 
@@ -29,10 +29,10 @@ def connected_parts(mask: np.ndarray, *, corners: bool = False) -> tuple[np.ndar
 
     Args:
         mask: (rows, columns) bool.
-        corners: whether pixels that touch only at a corner are connected.
+        corners: True if pixels that touch only at a corner are connected.
 
     Returns:
-        (rows, columns) int, the number of each pixel's part from 1 and 0 for unset pixels; and the number of parts.
+        (rows, columns) int, the part of each pixel, numbered from 1, and 0 for unset pixels; and the number of parts.
     """
     result: Any = ndimage.label(mask, np.ones((3, 3)) if corners else None)
     return np.asarray(result[0]), int(result[1])

@@ -1,5 +1,5 @@
-"""A body's own frame: origin under the body, z up, x and y along the body, so that the axes of a file do not affect a
-result."""
+"""The frame of a body: origin under the body, z up, x and y along the body. Results in this frame do not depend on the
+axes of a file."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 
 GROUND = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
-"""The ground in the body's own frame."""
+"""The ground in the frame of the body."""
 
 _REACH = 3.0
-"""Standard deviation, in median distances from the middle, of the Gaussian by which points are weighted. The weights
-keep outliers from rotating the frame."""
+"""Standard deviation of the Gaussian weight of points about the middle, in median distances from it. The weight
+prevents outliers from rotating the frame."""
 _ELONGATED = 0.05
-"""Second angular moment about the up direction, from 0 to 1, above which a body has a long side; the direction of a
-rounder body is that of its largest moment."""
+"""Second angular moment about the up direction, from 0 to 1, above which a body is elongated. The direction of a
+rounder body is defined by its largest angular moment."""
 _FOLDS = (1, 2, 3, 4, 5, 6)
 
 
 @dataclass(frozen=True)
 class BodyFrame:
-    """Position, axes and scale of a body's frame in the capture. Its lengths are metres once ``scale`` is metres per
-    unit."""
+    """Position, axes and scale of a body's frame in the capture. Lengths in the frame are in metres if ``scale`` is in
+    metres per unit of the capture."""
 
     axes: np.ndarray
-    """(3, 3) float64, rows are the body's x, y and z in the capture's axes; z is the plane's normal."""
+    """(3, 3) float64, the body's x, y and z as rows, in the axes of the capture; z is the normal of the plane."""
     origin: np.ndarray
-    """(3,) float64, capture's units, on the plane under the body's middle."""
+    """(3,) float64, position on the plane under the middle of the body, in units of the capture."""
     scale: float
-    """Body-frame length of one capture unit (metres per unit, once a body has its size)."""
+    """Length of one unit of the capture in the frame of the body, such as metres per unit."""
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Transform the capture's ``points`` (..., 3) to the body's frame."""
         return self.scale * ((np.asarray(points, float) - self.origin) @ self.axes.T)
 
     def capture_points(self, points: np.ndarray) -> np.ndarray:
-        """Transform points (..., 3) from the body's frame to the capture's."""
+        """Transform points (..., 3) from the frame of the body to that of the capture."""
         return self.origin + (np.asarray(points, float) / self.scale) @ self.axes
 
     def plane(self, plane: Plane) -> Plane:
@@ -62,28 +62,28 @@ class BodyFrame:
         return replace(self, scale=self.scale * factor)
 
     def moved(self, shift: np.ndarray) -> BodyFrame:
-        """Return the frame after the capture has moved by ``shift`` (3,), capture's units."""
+        """Return the frame after the capture has moved by ``shift`` (3,), in units of the capture."""
         return replace(self, origin=self.origin + shift)
 
 
 def upright_frame(points: np.ndarray, weights: np.ndarray, plane: Plane) -> BodyFrame:
     """Compute the frame of a body that stands on ``plane``. It rotates, moves and scales with the body.
 
-    The origin is the projection onto the plane of a robust middle: the fixed point of a mean with a wide Gaussian
-    weight around itself. x is the longer principal axis within the plane. If the body is nearly round about the up
-    direction, x follows the strongest of its angular moments sum w r^p e^(i m angle), m = 1 to 6. Among the m
-    directions that this leaves, x is the one closest to the moment m = 1, for which p is 3. The unit of length is the
-    median distance from the middle. The same points in the same order give the same bits.
+    The origin is the projection of a robust middle onto the plane. The middle is the fixed point of a mean with a wide
+    Gaussian weight around itself. x is the longer principal axis within the plane. If the body is nearly round about
+    the up direction, x is defined by the strongest of the angular moments sum w r^p e^(i m angle), m = 1 to 6. A moment
+    defines m directions, of which the one closest to the moment m = 1 is used; p is m, but 3 for m = 1. The unit of
+    length is the median distance from the middle. Equal points in equal order give equal bits.
 
     Args:
         points: (n, 3) points of the body.
-        weights: (n,) their weights.
+        weights: (n,) weights of the points.
         plane: the plane under the body.
 
     Raises:
         UserError: all points coincide.
     """
-    # If all weights are zero, use equal ones; the search for a body reports that nothing is opaque.
+    # If all weights are zero, use equal ones; a later stage reports that nothing is opaque.
     middle, reach, near = _middle(points, weights if weights.sum() > 0.0 else np.ones(len(points)))
     first, second = orthonormal_basis(plane.normal)
     arms = (points - middle) / reach
@@ -116,8 +116,10 @@ def _middle(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float,
 
 
 def _angular_moment(flat: np.ndarray, weights: np.ndarray, fold: int) -> complex:
-    """Return sum w r^p e^(i m angle) / sum w r^p of points (n,) x + iy; p is m, but 3 for m = 1, whose first moment
-    vanishes."""
+    """Return sum w r^p e^(i m angle) / sum w r^p of the points ``flat`` (n,), x + iy, with m = ``fold``.
+
+    p is m, but 3 for m = 1, because the moment with p = 1 vanishes about the mean.
+    """
     radius = np.abs(flat)
     power = 3 if fold == 1 else fold
     powers = flat**fold * radius ** (power - fold)

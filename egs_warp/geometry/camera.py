@@ -18,15 +18,15 @@ class Camera:
     cx: float
     cy: float
     rotation: np.ndarray
-    """(3, 3) float64, world to camera."""
+    """(3, 3) float64, rotation from world to camera axes."""
     translation: np.ndarray
-    """(3,) float64, world units."""
+    """(3,) float64, translation from world to camera, world units."""
     near: float = 0.01
     far: float = 1e6
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) camera centre in the world."""
+        """(3,) position of the camera centre, world units."""
         return -self.rotation.T @ self.translation
 
     @classmethod
@@ -42,8 +42,8 @@ class Camera:
         near: float = 0.01,
         far: float = 1e6,
     ) -> Camera:
-        """Create a camera at ``eye`` that looks at ``target``; ``up`` (not parallel to the view) points up in the
-        image."""
+        """Create a camera at ``eye`` (3,) with its optical axis towards ``target`` (3,); ``up`` (3,), which must not be
+        parallel to the axis, points up in the image."""
         forward = np.asarray(target, float) - np.asarray(eye, float)
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, np.asarray(up, float))
@@ -86,12 +86,14 @@ def fitted_camera(camera: Camera, points: np.ndarray, *, sides: float, top: floa
     centred.
 
     A point at depth d in front of the eye is within the margins if each of its two lateral offsets lies between fixed
-    slopes times d. Each margin is thus linear in the position of the eye, and the nearest position is computed exactly.
+    slopes times d. Each margin is thus linear in the position of the eye, so the nearest position can be computed
+    exactly.
 
     Args:
         camera: rotation and intrinsics; its principal point is in the picture.
-        points: world units.
-        sides, top, bottom: fractions of the distances from the principal point to the edges that the points may fill.
+        points: (n, 3), world units.
+        sides, top, bottom: maximum extent of the points from the principal point towards the left and right, top, and
+            bottom edges, as a fraction of the distance to the edge.
     """
     across, down, along = camera.rotation @ points.T
     centre, slopes = [], []
@@ -112,7 +114,7 @@ def fitted_camera(camera: Camera, points: np.ndarray, *, sides: float, top: floa
 
 
 def camera_rays(camera: Camera) -> np.ndarray:
-    """(H, W, 3) world-space rays r = R^T K^-1 [u, v, 1] of Eq. (18), with z-depth 1."""
+    """Return the rays (H, W, 3) r = R^T K^-1 [u, v, 1] of Eq. (18) in world axes, with z-depth 1."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
     return rays @ camera.rotation

@@ -1,4 +1,4 @@
-"""Orthonormal directions, rotations, boxes."""
+"""Directions, orthonormal bases, rotations and boxes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from egs_warp.errors import ArgumentError
 
 Direction: TypeAlias = np.ndarray | Sequence[float] | str
-"""Three numbers, or the name of an axis such as ``-y``."""
+"""A direction: three numbers, or the name of an axis such as ``-y``."""
 AXES = "x, y, z, -x, -y, -z"
 """Names of axes, for messages."""
 
@@ -47,8 +47,8 @@ def orthonormal_basis(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cross_matrices(arms: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) matrices with columns e_k x arm: the derivative of ``arms`` (n, 3) with respect to a rotation about
-    axis k."""
+    """Return the matrices (n, 3, 3) with columns e_k x arm: the derivatives of ``arms`` (n, 3) with respect to
+    rotations about the axes k."""
     matrices = np.zeros((len(arms), 3, 3))
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
@@ -57,17 +57,17 @@ def cross_matrices(arms: np.ndarray) -> np.ndarray:
 
 
 def kabsch_rotation(masses: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation that best maps the arms ``before`` (n, 3) to ``after`` (n, 3), weighted by ``masses`` (n,)
-    (Kabsch)."""
+    """Return the rotation (3, 3) that best maps the arms ``before`` (n, 3) to ``after`` (n, 3) in the least-squares
+    sense with weights ``masses`` (n,) (Kabsch)."""
     return nearest_rotation(np.einsum("n,ni,nj->ij", masses, after, before))
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation nearest to ``matrix`` (3, 3)."""
+    """Return the rotation (3, 3) nearest to ``matrix`` (3, 3)."""
     u, _, vt = np.linalg.svd(matrix)
     return u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))] @ vt
 
 
 def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of the box from ``low`` (3,) to ``high`` (3,)."""
+    """Return the corners (8, 3) of the box from ``low`` (3,) to ``high`` (3,)."""
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])

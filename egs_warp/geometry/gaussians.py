@@ -16,16 +16,16 @@ from egs_warp.launching import device_of, start_on_cpu
 from egs_warp.short_repr import short_repr
 
 SH_BAND_0 = 0.28209479177387814
-"""Spherical harmonic of band 0: a colour is 1/2 + SH_BAND_0 x its coefficient, higher bands apart."""
+"""Spherical harmonic of band 0: without higher bands, a colour is 1/2 + SH_BAND_0 times the coefficient of band 0."""
 ARRAYS = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 """Names of a cloud's arrays, in the order of its constructor."""
 _TRANSPARENT_LOGIT = -16.0
-"""Opacity logit of a hidden Gaussian: 1e-7, which no renderer draws."""
+"""Opacity logit of a hidden Gaussian, whose opacity of 1e-7 no renderer draws."""
 _THIRD_BELOW = 0.43
-"""Height of a mean, standard deviations, at which a third of a normal distribution lies below a plane."""
+"""Height of the mean above a plane at which a third of a normal distribution lies below it, in standard deviations."""
 MAX_VALUE, MAX_LOG_SCALE = 1e18, 41.0
-"""Limits for any number of a cloud and for the logarithm of a standard deviation: their squares are finite in single
-precision."""
+"""Maximum magnitude of any number of a cloud, and maximum logarithm of a standard deviation: squares of numbers within
+these limits are finite in single precision."""
 
 
 @dataclass(frozen=True)
@@ -35,18 +35,18 @@ class GaussianCloud:
     __repr__ = short_repr
 
     means: wp.array
-    """(n,) vec3, scene units (metres once animated)."""
+    """(n,) vec3, scene units; metres in the frame of a body."""
     rotations: wp.array
     """(n,) vec4, unit quaternions w, x, y, z."""
     log_scales: wp.array
     """(n,) vec3, natural logarithm of the standard deviation along each axis."""
     opacity_logits: wp.array
-    """(n,) float32, finite."""
+    """(n,) float32, finite logits of the opacities."""
     sh: wp.array
     """(n, (degree+1)^2) vec3: real spherical-harmonic coefficients of colour, band 0 first, in the INRIA convention."""
     antialiased: bool = False
-    """True if it was trained with antialiasing (the 3D and 2D filters of Mip-Splatting, gsplat's ``antialiased``): the
-    renderer then dims each splat by the factor by which the low-pass increases its area."""
+    """True if the capture was trained with antialiasing (the filters of Mip-Splatting, gsplat's ``antialiased``). The
+    renderer then divides the opacity of each splat by the factor by which the low-pass filter increases its area."""
 
     @classmethod
     def from_numpy(
@@ -80,10 +80,11 @@ class GaussianCloud:
         for name, (values, shape) in named.items():
             if np.shape(values) != shape:
                 raise UserError(f"capture: {name} has shape {np.shape(values)}, expected {shape}; export it again")
-            # Only the direction of a quaternion counts.
+            # The length of a quaternion is irrelevant.
             limit = {"log_scales": MAX_LOG_SCALE, "rotations": np.inf}.get(name, MAX_VALUE)
             floor = -np.inf if name == "log_scales" else -limit
-            # Both are NaN if any value is. The search for the first faulty Gaussian runs only if there is one.
+            # Minimum and maximum are NaN if any value is NaN. The first faulty Gaussian is searched only if there is
+            # one.
             lowest, highest = np.min(values, initial=0.0), np.max(values, initial=0.0)
             if np.isfinite(lowest) and np.isfinite(highest) and floor <= lowest and highest <= limit:
                 continue
@@ -115,7 +116,7 @@ class GaussianCloud:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle by the host arrays and the device's name."""
+        """Pickle the arrays as NumPy arrays, and the name of the device."""
         build = partial(GaussianCloud.from_numpy, antialiased=self.antialiased, device=str(self.device))
         return build, tuple(getattr(self, name).numpy() for name in ARRAYS)
 
@@ -135,13 +136,13 @@ class GaussianCloud:
         return device_of(self.means)
 
     def opacities(self) -> np.ndarray:
-        """(n,) float64 on the host, 0 to 1."""
+        """Return the opacities (n,) float64 on the host, 0 to 1."""
         with np.errstate(over="ignore"):
             return 1.0 / (1.0 + np.exp(-self.opacity_logits.numpy().astype(np.float64)))
 
     def breadths(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """(m,) float64 on the host, the middle standard deviation of those ``rows``, scene units. For a flat Gaussian
-        it is the width across."""
+        """Return the middle one of the three standard deviations (m,) float64 of the Gaussians ``rows``, on the host,
+        scene units. For a flat Gaussian, it is the smaller extent within its plane."""
         return np.exp(np.median(self.log_scales.numpy()[rows].astype(np.float64), axis=1))
 
     def scaled(self, factor: float) -> GaussianCloud:
@@ -176,14 +177,14 @@ class GaussianCloud:
 
 
 def unit_quaternions(quaternions: np.ndarray) -> np.ndarray:
-    """(n, 4) float32 quaternions of unit length; those of length 0 become the identity (w first).
+    """Return ``quaternions`` (n, 4), w first, normalised to float32; zero quaternions become the identity.
 
-    Quaternions that are already unit to rounding keep their bits, so that a capture survives any number of copies.
+    Quaternions that are normalised up to rounding keep their bits, so that repeated copies of a capture are identical.
     """
     lengths = np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions, dtype=np.float64))
     far = ~np.isfinite(lengths) | (lengths < 1e-150)
     if far.any():
-        # Doubles whose squares overflow or underflow, and zeros.
+        # Rescale doubles whose squares overflow or underflow, and zeros.
         largest = np.abs(quaternions[far]).max(axis=1, keepdims=True)
         quaternions = np.array(quaternions, dtype=np.float64)
         quaternions[far] /= np.where(largest > 0.0, largest, 1.0)
@@ -216,17 +217,17 @@ def concatenate(*clouds: GaussianCloud) -> GaussianCloud:
 
 
 def check_cloud(cloud: object) -> None:
-    """Raise ``ArgumentError`` unless ``cloud`` is a ``GaussianCloud``, for example the path of a file."""
+    """Raise ``ArgumentError`` if ``cloud`` is not a ``GaussianCloud`` but, for example, the path of a file."""
     if not isinstance(cloud, GaussianCloud):
         advice = "give Gaussians, as read_capture returns them"
         raise ArgumentError("cloud", advice, value=f"{str(cloud)[:80]} ({type(cloud).__name__})")
 
 
 def hidden_below(cloud: GaussianCloud, plane: Plane, *, margin: float) -> GaussianCloud:
-    """Return ``cloud`` with the Gaussians below ``plane`` made transparent; their number and order stay.
+    """Return ``cloud`` with the Gaussians below ``plane`` made transparent; number and order do not change.
 
-    They have their mean more than ``margin`` (world units) below it, or a third of their mass below it and a standard
-    deviation that reaches four times as deep.
+    A Gaussian is below the plane if its mean is more than ``margin`` (world units) below it, or if a third of its mass
+    is below the plane and the point one standard deviation below its mean is deeper than four margins.
     """
     heights = plane.heights(cloud.means.numpy())
     axes = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
@@ -240,8 +241,8 @@ def hidden_below(cloud: GaussianCloud, plane: Plane, *, margin: float) -> Gaussi
 
 
 def most_visible(cloud: GaussianCloud, count: int) -> GaussianCloud:
-    """Return the ``count`` Gaussians with the largest product of opacity and area, in their order; the cloud itself if
-    it has no more."""
+    """Return the ``count`` Gaussians with the largest products of opacity and area, in their original order; the cloud
+    itself if it has at most ``count``."""
     if cloud.count <= count:
         return cloud
     log_areas = np.sort(cloud.log_scales.numpy().astype(np.float64), axis=1)[:, 1:].sum(axis=1)

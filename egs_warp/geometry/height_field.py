@@ -20,17 +20,16 @@ _MAX_NODES = 1 << 22
 
 @dataclass(frozen=True)
 class HeightField:
-    """A biquadratic B-spline over a square grid: heights and slopes are continuous, and so is the normal.
+    """A biquadratic B-spline over a square grid, with continuous heights and normals.
 
-    Outside the grid, the height at its edge continues unchanged. Lengths are in the units of the frame of ``axes`` and
-    ``origin``.
+    Outside the grid, the height is that of the nearest point of its edge. Lengths are in the units of the frame of
+    ``axes`` and ``origin``.
     """
 
     __repr__ = short_repr
 
     axes: np.ndarray
-    """(3, 3) rows: the grid's columns run along the first, its rows along the second, heights along the third;
-    right-handed."""
+    """(3, 3) right-handed unit vectors as rows: directions of increasing column, of increasing row, and of height."""
     origin: np.ndarray
     """(3,) position of node (0, 0) at height 0."""
     spacing: float
@@ -58,26 +57,27 @@ class HeightField:
         return self.axes[0], self.axes[1]
 
     def ground_height(self, points: np.ndarray) -> np.ndarray:
-        """(...,) height of the ground over its plane, below or above ``points`` (..., 3)."""
+        """Return the height (...,) of the ground over its plane at the projections of ``points`` (..., 3)."""
         return self._spline(np.asarray(points, float))[0]
 
     def heights(self, points: np.ndarray) -> np.ndarray:
-        """(...,) height of ``points`` (..., 3) over the ground, along the plane's normal; positive above."""
+        """Return the height (...,) of ``points`` (..., 3) over the ground, along the plane's normal; positive above."""
         points = np.asarray(points, float)
         return (points - self.origin) @ self.axes[2] - self._spline(points)[0]
 
     def gaps(self, points: np.ndarray) -> np.ndarray:
-        """(...,) distance of ``points`` (..., 3) from the tangent plane of the ground under them; negative inside.
+        """Return the distance (...,) of ``points`` (..., 3) from the tangent plane of the ground under them; negative
+        below.
 
-        It is zero on the ground, where its gradient is the normal; elsewhere it is the distance to first order.
+        It vanishes on the ground, where its gradient is the normal. Elsewhere, it is the distance to first order.
         """
         points = np.asarray(points, float)
         height, (first, second) = self._spline(points)
         return ((points - self.origin) @ self.axes[2] - height) / np.sqrt(1.0 + first**2 + second**2)
 
     def frames(self, points: np.ndarray) -> np.ndarray:
-        """(n, 3, 3) rows: the ground's normal under ``points`` (n, 3) and two tangents, unit, right-handed in this
-        order. They vary continuously."""
+        """Return right-handed orthonormal frames (n, 3, 3) as rows: the ground's normal under ``points`` (n, 3) and two
+        tangents. They vary continuously."""
         _, (first, second) = self._spline(np.asarray(points, float))
         zero, one = np.zeros_like(first), np.ones_like(first)
         normal = np.stack([-first, -second, one], axis=1) / np.sqrt(1.0 + first**2 + second**2)[:, None]
@@ -92,8 +92,8 @@ class HeightField:
         return distance
 
     def flatten(self, points: np.ndarray) -> np.ndarray:
-        """Move ``points`` (n, 3) along the plane's normal so that their heights over the ground become heights over the
-        plane."""
+        """Move ``points`` (n, 3) along the plane's normal so that their heights over the plane become equal to their
+        heights over the ground before."""
         return points - self.ground_height(points)[:, None] * self.axes[2]
 
     def unflatten(self, points: np.ndarray) -> np.ndarray:
@@ -101,7 +101,7 @@ class HeightField:
         return points + self.ground_height(points)[:, None] * self.axes[2]
 
     def nodes(self) -> np.ndarray:
-        """(rows, columns, 3) positions of the nodes, on the ground."""
+        """Return the positions (rows, columns, 3) of the nodes on the ground."""
         at = np.stack(np.meshgrid(*(np.arange(count) for count in self.coefficients.shape[::-1])), axis=-1)
         flat = self.origin + self.spacing * (at @ self.axes[:2])
         return flat + self._spline(flat)[0][..., None] * self.axes[2]
@@ -120,14 +120,14 @@ class HeightField:
         return replace(self, origin=self.origin + shift)
 
     def coarser(self, spacing: float) -> HeightField:
-        """Return the ground smoothed to nodes ``spacing`` apart, or this field if it is already as coarse. Features
-        narrower than two spacings lose most of their height."""
+        """Return the ground smoothed to a node ``spacing``, or this field if it is already as coarse. Features narrower
+        than two spacings lose most of their height."""
         if spacing <= self.spacing:
             return self
         ratio = spacing / self.spacing
         heights = (self.nodes() - self.origin) @ self.axes[2]
-        # The blur is half a spacing wide: features two spacings long keep 30 % of their height, features four spacings
-        # long 74 %.
+        # The standard deviation of the blur is half a spacing: features of a wavelength of two spacings keep 30 % of
+        # their height, features of four spacings 74 %.
         smooth = np.asarray(ndimage.gaussian_filter(heights, 0.5 * ratio, mode="nearest"))
         rows, columns = (max(int(np.ceil((count - 1) / ratio)) + 1, 3) for count in heights.shape)
         at = np.stack(np.meshgrid(ratio * np.arange(rows), ratio * np.arange(columns), indexing="ij"))
@@ -135,7 +135,7 @@ class HeightField:
         return HeightField.through(self.axes, self.origin, spacing, sampled)
 
     def _spline(self, points: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Return the height (...,) at ``points`` (..., 3) and its two slopes."""
+        """Return the height (...,) of the ground at ``points`` (..., 3), and its slopes (...,) along both tangents."""
         away = (points - self.origin) / self.spacing
         (column, across), (row, along) = (_weights(away @ axis) for axis in self.axes[:2])
         rows, columns = self.coefficients.shape
@@ -161,8 +161,8 @@ def check_grid(field: HeightField) -> None:
 
 
 def _weights(place: np.ndarray) -> tuple[np.ndarray, tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]]:
-    """Return the nearest node of each ``place`` (in spacings), the weights of the previous, this and the next node, and
-    the derivatives of these weights."""
+    """Return the index of the node nearest to each ``place`` (in spacings), the weights of this node's predecessor, of
+    itself and of its successor, and the derivatives of these weights."""
     nearest = np.floor(place + 0.5)
     f = place - nearest
     weights = (0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2)

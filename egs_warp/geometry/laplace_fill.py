@@ -8,8 +8,8 @@ from scipy.sparse.linalg import spsolve
 
 
 def laplace_fill(values: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """Return ``values`` (rows, columns) or (rows, columns, channels) with the solution of Laplace's equation in
-    ``hole`` (rows, columns)."""
+    """Return ``values`` (rows, columns) or (rows, columns, channels), replaced by the solution of Laplace's equation
+    inside ``hole`` (rows, columns) bool."""
     index = np.full(hole.shape, -1)
     index[hole] = np.arange(hole.sum())
     rows, columns, sums = [], [], np.zeros((int(hole.sum()), *values.shape[2:]))

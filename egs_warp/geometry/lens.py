@@ -22,18 +22,19 @@ _RADII = 512
 
 @dataclass(frozen=True)
 class Lens:
-    """Map from points (x, y) of a pinhole's plane z = 1 to their distorted position. The defaults are a pinhole."""
+    """Map from points (x, y) on the plane z = 1 of a pinhole camera to their distorted positions. The default is the
+    identity."""
 
     fisheye: bool = False
-    """True if the distortion polynomials take the angle from the optical axis, not its tangent."""
+    """True if the argument of the distortion polynomials is the angle from the optical axis, not its tangent."""
     radial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Coefficients k1 to k4 of r^2, r^4, r^6, r^8."""
     rational: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Coefficients of r^2, r^4, r^6 in the denominator (OpenCV's k4 to k6)."""
     tangential: tuple[float, float] = (0.0, 0.0)
-    """Coefficients p1, p2."""
+    """Coefficients p1 and p2 of the tangential distortion."""
     thin_prism: tuple[float, float] = (0.0, 0.0)
-    """Coefficients of r^2 along x and y."""
+    """Coefficients of r^2 of the thin prism terms along x and y."""
     field_of_view: float = 0.0
     """Angle in rad of the FOV model, used if above 0."""
     division: float = 0.0
@@ -42,11 +43,11 @@ class Lens:
     unified: tuple[float, float] = (0.0, 1.0)
     """Parameters alpha and beta of the enhanced unified camera model (EUCM)."""
     high_radial: tuple[float, float] = (0.0, 0.0)
-    """Coefficients of r^10 and r^12."""
+    """Coefficients of r^10 and r^12 of the radial polynomial."""
     high_thin_prism: tuple[float, float] = (0.0, 0.0)
-    """Coefficients of r^4 along x and y."""
+    """Coefficients of r^4 of the thin prism terms along x and y."""
     is_chained: bool = False
-    """Tangential and thin prism terms apply to the radially distorted position, as in Fisheye624."""
+    """True if tangential and thin prism terms apply to the radially distorted position, as in Fisheye624."""
 
     @classmethod
     def named(cls, model: str, numbers: Mapping[str, float]) -> Lens | None:
@@ -92,13 +93,13 @@ class Lens:
         return replace(self, unified=(self.unified[0], 1.0)) != Lens()
 
     def distorted(self, points: np.ndarray) -> np.ndarray:
-        """(..., 2) distorted positions of ``points`` (..., 2) on the plane z = 1."""
+        """Return the distorted positions (..., 2) of ``points`` (..., 2) on the plane z = 1."""
         points = np.asarray(points, dtype=float)
         if self.field_of_view > 0:
             radius = np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-12)
             return points / radius * np.arctan(2 * radius * np.tan(self.field_of_view / 2)) / self.field_of_view
         if self.division != 0.0:
-            # The smaller root of k r r_d^2 - r_d + r = 0. Beyond the last radius with a root, the image folds back.
+            # Use the smaller root of k r r_d^2 - r_d + r = 0. Beyond the last radius with a root, the image folds back.
             root = 1.0 - 4.0 * self.division * (points**2).sum(axis=-1, keepdims=True)
             return np.where(root >= 0.0, 2.0 * points / (1.0 + np.sqrt(np.maximum(root, 0.0))), 0.0)
         alpha, beta = self.unified
@@ -146,7 +147,7 @@ class Undistortion:
     source: np.ndarray
     """(H, W, 2) float32, column and row in the photo, pixel centres at +0.5."""
     known: np.ndarray
-    """(H, W) bool, True where the photo shows the pixel."""
+    """(H, W) bool, True for pixels inside the view of the photo."""
 
     @classmethod
     def of(cls, camera: Camera, lens: Lens) -> Undistortion:
@@ -163,7 +164,7 @@ class Undistortion:
         return self._remap(mask.astype(np.uint8), cv2.INTER_NEAREST) > 0
 
     def _remap(self, pixels: np.ndarray, interpolation: int) -> np.ndarray:
-        # OpenCV counts from the centre of the first pixel.
+        # In OpenCV, the centre of the first pixel is at 0.
         position = self.source - np.float32(0.5)
         return cv2.remap(
             pixels, position[..., 0], position[..., 1], interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0

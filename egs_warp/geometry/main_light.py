@@ -17,12 +17,12 @@ class MainLight:
     direction: np.ndarray
     """(3,) unit vector to the light."""
     half_angle: float
-    """Degrees, half of the angle under which the light is seen: the softness of its shadow."""
+    """Half of the apparent angular diameter of the light, degrees, which defines the softness of its shadow."""
     shade: float
-    """Fraction, 0 to 1, of the displayed brightness of the ground that its shadow removes."""
+    """Fraction of the displayed brightness of the ground that the shadow removes, 0 to 1."""
     irradiance: np.ndarray
-    """(4, 4) symmetric M with E(n) = (n, 1) M (n, 1), the irradiance of a surface with unit normal n up to a factor:
-    spherical harmonics up to order 2 as a quadratic form (Ramamoorthi and Hanrahan 2001, Eq. 11)."""
+    """(4, 4) symmetric matrix M of the irradiance E(n) = (n, 1) M (n, 1) of a surface with unit normal n, up to a
+    factor: spherical harmonics up to order 2 as a quadratic form (Ramamoorthi and Hanrahan 2001, Eq. 11)."""
 
     def rotated(self, axes: np.ndarray) -> MainLight:
         """Return the light in other axes, the rows of ``axes`` (3, 3)."""
@@ -32,7 +32,7 @@ class MainLight:
 
 
 def check_light(light: MainLight) -> None:
-    """Raise ``ValueError`` for a light whose numbers are not finite or outside of their ranges."""
+    """Raise ``ValueError`` if a number of the light is not finite or out of range."""
     numbers = np.concatenate([light.direction, light.irradiance.ravel()])
     is_valid = np.isfinite(numbers).all() and abs(float(np.linalg.norm(light.direction)) - 1.0) < 1e-3
     is_valid &= 0.0 < light.half_angle < 90.0 and 0.0 <= light.shade < 1.0 and mean_irradiance(light) > 0.0
@@ -41,19 +41,19 @@ def check_light(light: MainLight) -> None:
 
 
 def mean_irradiance(light: MainLight) -> float:
-    """Return the mean irradiance of all normals."""
+    """Return the mean of the irradiance over all normals."""
     return float(light.irradiance[3, 3] + np.trace(light.irradiance[:3, :3]) / 3.0)
 
 
 def irradiance_form(ambient: float, slope: float, up: np.ndarray, key: float, direction: np.ndarray) -> np.ndarray:
-    """Return the quadratic form (4, 4) of an ambient light that changes linearly with height, and of a distant light.
+    """Return the quadratic form (4, 4) of the irradiance from an ambient light and a distant light.
 
-    The form of max(n . l, 0) is its projection onto spherical harmonics of order 2:
-    1/4 + c/2 + 5/32 (3 c^2 - 1) with c = n . l.
+    The ambient irradiance is linear in n . up. For the distant light, max(n . l, 0) is projected onto spherical
+    harmonics up to order 2: 1/4 + c/2 + 5/32 (3 c^2 - 1) with c = n . l.
 
     Args:
         ambient: irradiance of a vertical surface by the ambient light.
-        slope: what a surface that faces up receives in addition, and one that faces down less.
+        slope: additional irradiance of a surface that faces up; a surface that faces down receives less by this amount.
         up: (3,) unit vector.
         key: irradiance of a surface that faces the distant light.
         direction: (3,) unit vector to the distant light.

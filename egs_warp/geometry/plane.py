@@ -1,4 +1,4 @@
-"""The plane the object rests on: N.x + d = 0."""
+"""The plane on which the object rests: N.x + d = 0."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class Plane:
     """The plane N.x + d = 0 with |N| = 1 and N pointing to the object's side (up)."""
 
     normal: np.ndarray
-    """(3,) float64, unit."""
+    """(3,) float64, unit normal N."""
     offset: float
-    """d, in the units of x."""
+    """Offset d, in the units of x."""
 
     @classmethod
     def from_coefficients(cls, nx: float, ny: float, nz: float, d: float) -> Plane:
@@ -35,7 +35,7 @@ class Plane:
         return cls(normal / length, float(d) / length)
 
     def heights(self, points: np.ndarray) -> np.ndarray:
-        """(...,) signed distance of ``points`` (..., 3), positive above."""
+        """Return the signed distance (...,) of ``points`` (..., 3) from the plane, positive above."""
         return np.asarray(points, float) @ self.normal + self.offset
 
     def scaled(self, factor: float) -> Plane:

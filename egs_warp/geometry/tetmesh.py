@@ -20,13 +20,13 @@ class TetMesh:
     __repr__ = short_repr
 
     nodes: np.ndarray
-    """(N, 3) float64, m."""
+    """(N, 3) float64, m, positions of the nodes."""
     tets: np.ndarray
-    """(T, 4) int32, node indices; (x1-x0, x2-x0, x3-x0) is right-handed."""
+    """(T, 4) int32, node indices of the tetrahedra; (x1-x0, x2-x0, x3-x0) is right-handed."""
 
     @classmethod
     def oriented(cls, nodes: np.ndarray, tets: np.ndarray) -> TetMesh:
-        """Create the mesh with each left-handed tetrahedron (fTetWild's winding) made right-handed.
+        """Create the mesh, and invert left-handed tetrahedra (fTetWild's winding), so that all are right-handed.
 
         Raises ``UserError`` if an element has no volume.
         """
@@ -42,20 +42,21 @@ class TetMesh:
         return cls(nodes, tets)
 
     def volumes(self) -> np.ndarray:
-        """(T,) float64, m^3, positive."""
+        """Return the volumes (T,) float64, m^3, of the tetrahedra, which are positive."""
         return _signed_volumes(self.nodes, self.tets)
 
     def lumped_masses(self, density: float) -> np.ndarray:
-        """(N,) float64, kg: a quarter of each tetrahedron's mass on each of its nodes. ``density`` is in kg/m^3."""
+        """Return the nodal masses (N,) float64, kg: each tetrahedron adds a quarter of its mass to each of its nodes.
+        ``density`` is in kg/m^3."""
         masses = np.zeros(len(self.nodes))
         np.add.at(masses, self.tets.ravel(), np.repeat(density * self.volumes() / 4.0, 4))
         return masses
 
     def boundary_faces(self) -> np.ndarray:
-        """(B, 3) int32 node indices of the surface triangles, wound outwards; the array is read-only."""
+        """Return the node indices (B, 3) int32 of the surface triangles, wound outwards; the array is read-only."""
         return self._surface
 
-    # Both are cached, because each motion requests them when it starts.
+    # Surface and mean edge are cached, because each motion requests them when it starts.
     @cached_property
     def _surface(self) -> np.ndarray:
         faces = self.tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
@@ -69,7 +70,7 @@ class TetMesh:
         return float(edge_graph(self).data.mean())
 
     def min_dihedral_degrees(self) -> float:
-        """Return the smallest dihedral angle between two faces of one tetrahedron, degrees."""
+        """Return the minimum dihedral angle between two faces of a tetrahedron, degrees."""
         corners = self.nodes[self.tets]
         normals = np.stack(
             [
@@ -95,7 +96,7 @@ def _signed_volumes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
 
 
 def edge_graph(mesh: TetMesh) -> sp.csr_matrix:
-    """(N, N) symmetric matrix whose entry (a, b) is the length, in metres, of the edge from node a to node b."""
+    """Return the symmetric matrix (N, N) whose entry (a, b) is the length in metres of the edge from node a to b."""
     pairs = mesh.tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
     pairs = np.unique(np.sort(pairs, axis=1), axis=0)
     lengths = np.linalg.norm(mesh.nodes[pairs[:, 0]] - mesh.nodes[pairs[:, 1]], axis=1)

@@ -8,9 +8,9 @@ import numpy as np
 
 
 def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (k, w) distinct rows of ``rows`` (n, w) in ascending order, and (n,) the index of each row among them.
+    """Return the distinct rows (k, w) of ``rows`` (n, w) in ascending order, and the index (n,) of each row in them.
 
-    The result is that of ``np.unique`` along axis 0 but takes an eighth of the time.
+    The result equals that of ``np.unique`` along axis 0, in an eighth of the time.
     """
     order = _ascending(rows)
     ordered = rows[order]
@@ -22,7 +22,8 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ascending(rows: np.ndarray) -> np.ndarray:
-    """(n,) indices that sort ``rows`` (n, w), stable for equal rows. Each row is packed into one integer if it fits."""
+    """Return the indices (n,) that sort ``rows`` (n, w), stable for equal rows. A row is packed into one integer if it
+    fits."""
     if len(rows) == 0:
         return np.zeros(0, np.int64)
     low, high = rows.min(axis=0), rows.max(axis=0)

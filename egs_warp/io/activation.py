@@ -1,4 +1,5 @@
-"""Detection of files that contain activated scales and opacities where their format has logarithms and logits."""
+"""Detection of files that contain activated scales and opacities instead of the logarithms and logits of their
+format."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from egs_warp.io.limits import MIN_LOG_SCALE
 from egs_warp.io.raw import RawCapture, logits_from_opacities
 
 _MIN_COUNT = 20
-"""Minimum number of Gaussians for a decision: the values of a few may look activated by chance."""
+"""Minimum number of Gaussians for a decision, because a few values may look activated by chance."""
 _SAMPLE = 1000
 """Number of Gaussians that are tested first, which is enough to exclude activated values in most files."""
 
@@ -18,17 +19,17 @@ _SAMPLE = 1000
 def with_logarithms(raw: RawCapture) -> RawCapture:
     """Return ``raw`` with logarithms and logits if it evidently contains activated values, with a note.
 
-    All scales are then positive and all opacities within 0 to 1: as logarithms and logits, each Gaussian would be wider
-    than one unit and half transparent. If the opacities are not within 0 to 1 or are all the same, positive scales
-    count as activated if most Gaussians would otherwise be wider than the capture. Opacities alone are not evidence:
-    they are kept, with a note.
+    Values are considered activated if all scales are positive and all opacities are within 0 to 1: as logarithms and
+    logits, they would make each Gaussian wider than one unit and half transparent. If the opacities are not within 0 to
+    1 or are all equal, positive scales are considered activated if most Gaussians would otherwise be wider than the
+    capture. Opacities alone are not sufficient evidence; they are not changed, with a note.
     """
     few = slice(0, _SAMPLE)
     if len(raw.means) < _MIN_COUNT or (
         bool(np.any(raw.log_scales[few, :2] < 0.0)) and not _within(raw.opacity_logits[few])
     ):
         return raw
-    # The third scale of a flat Gaussian is absent or minus infinity, or 0 if the scales are activated.
+    # The third scale of a flat Gaussian is missing, minus infinity, or 0 if the scales are activated.
     scales, opacities = raw.log_scales, raw.opacity_logits
     absent = ~(scales > MIN_LOG_SCALE)
     positive = bool((absent | (scales >= 0.0)).all() and (scales > 0.0).any())

@@ -1,7 +1,7 @@
-"""Named arrays in one file: ``.npz`` as ``numpy.savez`` writes it.
+"""Named arrays in one file: ``.npz`` files as written by ``numpy.savez``.
 
-Such files may be damaged or untrusted: the sizes that a file declares are compared with its own size before memory is
-allocated.
+Such files may be damaged or untrusted. Therefore the sizes that a file declares are compared with the size of the file
+before memory is allocated.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
         members = archive.infolist()
         if any(member.compress_type != zipfile.ZIP_STORED for member in members):
             raise ValueError("its arrays are compressed")
-        # Members may overlap, and each would be read completely.
+        # Members may overlap in a crafted file, and each would be read completely.
         if sum(member.file_size for member in members) > path.stat().st_size:
             raise ValueError("its arrays are larger than the file")
         # Each member is read completely, which verifies its checksum, before its content is used.

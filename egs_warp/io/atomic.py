@@ -30,11 +30,11 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside ``path``, with its suffix; move the file to ``path`` when the block ends without
     error.
 
-    If the block fails, an existing file at ``path`` stays unchanged and the temporary one is removed; one that a killed
-    process leaves is removed by the next ``sweep``. Raises ``UserError`` if the folder is missing or the file cannot be
-    written.
+    If the block fails, an existing file at ``path`` stays unchanged and the temporary file is removed. The temporary
+    file of a killed process is removed by the next ``sweep``. Raises ``UserError`` if the folder is missing or the file
+    cannot be written.
     """
-    # A link is followed, as by open(); os.replace would replace the link itself.
+    # Follow links, as open() does; os.replace would replace the link itself.
     target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
         raise UserError(f"{path}: its folder does not exist; create {target.parent} first")
@@ -69,7 +69,7 @@ def writable_folder(path: Path | str) -> Path:
         probe.unlink()
     except OSError as error:
         raise UserError(f"{path}: cannot write into this folder ({_reason(error)}); choose another one") from error
-    # The path contains a null byte.
+    # Raised if the path contains a null byte.
     except ValueError as error:
         raise UserError(f"{path}: cannot write into this folder ({error}); choose another one") from error
     sweep(folder)
@@ -102,7 +102,7 @@ def sweep(folder: Path) -> bool:
     """Remove files that ``atomic_write`` of killed processes left in ``folder``; files of running processes are locked
     and remain.
 
-    Returns True if some files are too young to tell whether a running process is about to lock them.
+    Returns True if some files are so young that a running process may be about to lock them.
     """
     young = False
     if fcntl is None:
@@ -120,15 +120,15 @@ def sweep(folder: Path) -> bool:
                     os.unlink(entry.path)
             finally:
                 os.close(descriptor)
-        # Another process removed the file first, or the file belongs to another user.
+        # Another process has removed the file, or the file belongs to another user.
         except OSError:
             continue
     return young
 
 
 def sweep_all(folder: Path) -> None:
-    """Call ``sweep`` until no file is too young, for a few seconds at most: a program that a killed process had
-    started, such as ffmpeg, may have written for a little longer."""
+    """Call ``sweep`` until no file is too young, for a few seconds at most. A program that a killed process had
+    started, such as ffmpeg, may have continued to write for a short time."""
     deadline = time.monotonic() + 2.0 * _MIN_AGE
     while sweep(folder) and time.monotonic() < deadline:
         time.sleep(0.05 * _MIN_AGE)
@@ -136,8 +136,8 @@ def sweep_all(folder: Path) -> None:
 
 @contextmanager
 def lock(path: Path) -> Iterator[bool]:
-    """Yield True if this process holds the lock file ``path``, which is removed when the block ends, and False if
-    another process holds it."""
+    """Lock the file ``path`` for the duration of the block, and remove it afterwards. Yield True if this process has
+    the lock, and False if another process has it."""
     while True:
         descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
         if fcntl is not None and not _try_lock(descriptor):
@@ -150,7 +150,7 @@ def lock(path: Path) -> Iterator[bool]:
             same = False
         if same:
             break
-        # The last holder of the lock removed the file in the meantime.
+        # The previous holder of the lock has removed the file in the meantime.
         os.close(descriptor)
     try:
         yield True
@@ -176,8 +176,8 @@ def _temporary_name(folder: Path, suffix: str) -> Path:
 
 
 def system_error(message: str) -> OSError | None:
-    """Return the error of the operating system, such as a full disk, that the ``message`` of a program or library
-    names; None if it names none."""
+    """Return the error of the operating system, such as a full disk, that is named in the ``message`` of a program or
+    library; None if the message names none."""
     number = next((number for number in _SYSTEM_ERRORS if os.strerror(number) in message), None)
     return None if number is None else OSError(number, os.strerror(number))
 

@@ -18,39 +18,44 @@ from egs_warp.io.raw import logits_from_opacities
 from egs_warp.version import __version__
 
 BLOCK_FRAMES = 60
-"""Number of frames of a block; a player starts when it has the first block."""
+"""Number of frames in a block. A player can start when it has received the first block."""
 _BAND_STEP = 1.0 / 64.0
-"""Step of the coefficients of the bands above 0, unless their largest needs more than 127 of them. Finer steps are
-noise that cannot be deflated: half of a bundle."""
+"""Quantisation step of SH coefficients above band 0; it is larger if the largest coefficient exceeds 127 of these
+steps. Finer steps would only store noise that cannot be compressed, which would be half of a bundle."""
 _ROTATION_STEP, _SCALE_STEP, _COLOUR_STEP, _ARM_STEP = 1.0 / 512.0, 1.0 / 128.0, 1.0 / 512.0, 1.0 / 4096.0
-"""Steps of rotation vectors in rad, log scales, colours, and of bulges and lengths of arms in standard deviations."""
+"""Quantisation steps of rotation vectors (rad), log scales, colours, and bulges and lengths of arms (standard
+deviations)."""
 
 
 @dataclass(frozen=True)
 class BundleCage:
-    """Cage of a body, the embedding of its n Gaussians, of which r have the carrier ``ARMS``, and its motion."""
+    """Cage of a body, the embedding of its Gaussians, and its motion.
+
+    In the shapes below, n is the number of Gaussians, and r of those with the carrier ``ARMS``.
+    """
 
     rest_nodes: np.ndarray
     """(N, 3) float32, rest positions."""
     cage_tets: np.ndarray
-    """(T, 4) nodes of each tetrahedron."""
+    """(T, 4) node indices of each tetrahedron."""
     surface: np.ndarray
-    """(B, 3) nodes of the surface triangles, wound outwards."""
+    """(B, 3) node indices of the surface triangles, wound outwards."""
     tets: np.ndarray
-    """(n,) tetrahedron of each mean."""
+    """(n,) index of the tetrahedron that contains each mean."""
     carriers: np.ndarray
-    """(n,) uint8, ``Carrier``."""
+    """(n,) uint8, ``Carrier`` of each Gaussian."""
     arm_tets: np.ndarray
-    """(r, 6) tetrahedra of the ends of the three axes, first the positive and then the negative ends."""
+    """(r, 6) indices of the tetrahedra that contain the ends of the three axes: the positive, then the negative
+    ends."""
     arm_shares: np.ndarray
     """(r, 6) fraction of each semi-axis that lies in the tetrahedron of the mean; used where ``arm_lengths`` is 0."""
     arm_lengths: np.ndarray
-    """(r, 6) length of a semi-axis that ends beyond the neighbours of that tetrahedron, in standard deviations along
-    its axis; 0 for other semi-axes."""
+    """(r, 6) lengths of semi-axes that end beyond the neighbours of the mean's tetrahedron, in standard deviations
+    along the axis; 0 for other semi-axes."""
     arm_bulges: np.ndarray
-    """(r, 3) shift of the mean by the difference of two opposite semi-axes, in standard deviations along their axis."""
+    """(r, 3) shifts of the mean due to the difference of two opposite semi-axes, in standard deviations along them."""
     max_stretch: float
-    """Largest stretch of a semi-axis relative to the material at its two ends."""
+    """Maximum stretch of a semi-axis relative to the material at its two ends."""
     nodes: np.ndarray
     """(F, N, 3) positions of the nodes in each frame."""
 
@@ -61,9 +66,9 @@ class BundleBody:
 
     name: str
     splats: GaussianCloud
-    """(n,) at rest, after splitting."""
+    """The n Gaussians at rest, after splitting."""
     cage: BundleCage | None = None
-    """None for static splats, such as the rest of a scene."""
+    """Cage of the splats; None for static splats, such as the rest of a scene."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,7 @@ class Bundle:
     frames: int
     """Number of frames of every cage."""
     facts: Mapping[str, Any]
-    """Further properties of the JSON text: ``title``, ``licence``, ``up``, ``metres_per_unit``, ``height``, ``front``,
+    """Other properties of the JSON text: ``title``, ``licence``, ``up``, ``metres_per_unit``, ``height``, ``front``,
     ``flat_ground``, ``camera``, ``capture``."""
 
 
@@ -112,7 +117,7 @@ def bundle_file(bundle: Bundle) -> bytes:
     moving = [(facts, body.cage) for facts, body in zip(bodies, bundle.bodies, strict=True) if body.cage is not None]
     for facts, _ in moving:
         facts |= {"blocks": [], "node_error": 0.0}
-    # Blocks of equal time are neighbours in the file, so that all bodies can move when they have arrived.
+    # Blocks of all bodies for the same time are adjacent in the file, so that all bodies can move as soon as possible.
     for first in range(0, bundle.frames, BLOCK_FRAMES):
         for facts, cage in moving:
             nodes = cage.nodes[first : first + BLOCK_FRAMES]
@@ -202,7 +207,7 @@ def _cloud(numbers: Mapping[str, np.ndarray], antialiased: bool) -> GaussianClou
 
 
 def _rotation_vectors(quaternions: np.ndarray) -> np.ndarray:
-    """Return axis times angle (n, 3), rad, at most pi, of unit quaternions (n, 4) w, x, y, z."""
+    """Return the rotation vectors (n, 3), rad, of length at most pi, of unit quaternions (n, 4) w, x, y, z."""
     q = quaternions.astype(np.float64)
     q = np.where(q[:, :1] < 0.0, -q, q)
     sines = np.linalg.norm(q[:, 1:], axis=1)
@@ -211,7 +216,7 @@ def _rotation_vectors(quaternions: np.ndarray) -> np.ndarray:
 
 
 def _quaternions(vectors: np.ndarray) -> np.ndarray:
-    """Return unit quaternions (n, 4) w, x, y, z of axis times angle (n, 3), rad."""
+    """Return the unit quaternions (n, 4) w, x, y, z of rotation ``vectors`` (n, 3), rad."""
     halves = 0.5 * np.linalg.norm(vectors, axis=1, keepdims=True)
     # np.sinc(x) is sin(pi x) / (pi x).
     return np.concatenate([np.cos(halves), 0.5 * vectors * np.sinc(halves / np.pi)], axis=1)
@@ -220,7 +225,7 @@ def _quaternions(vectors: np.ndarray) -> np.ndarray:
 def _cage_arrays(cage: BundleCage) -> dict[str, PackedArray]:
     rows = cage.carriers == Carrier.ARMS
     tets = indices(cage.tets)
-    # Most ends are in the tetrahedron of the mean or near it, and small differences are compressed well.
+    # Most ends are in or near the tetrahedron of the mean, and small differences are compressed well.
     ends = cage.arm_tets.astype(tets.stored.dtype) - tets.stored[rows, None]
     return {
         "rest_nodes": PackedArray(cage.rest_nodes.astype(np.float32)),
@@ -236,13 +241,13 @@ def _cage_arrays(cage: BundleCage) -> dict[str, PackedArray]:
 
 
 def _quantised_track(nodes: np.ndarray) -> tuple[PackedArray, PackedArray]:
-    """Return the lower corner of the body in each frame, and the positions (f, N, 3) relative to it.
+    """Return the lower corner (f, 3) of the body in each frame, and the quantised positions (f, N, 3) relative to it.
 
-    The error depends on the size of the body, not on the distance that it covers.
+    The quantisation error depends on the size of the body, not on the distance that it moves.
     """
     lows = nodes.min(axis=1)
     origins = lows.astype(np.float32)
-    # No position is below its origin after rounding.
+    # Round the origins down, so that no position is below its origin.
     origins = np.where(origins > lows, np.nextafter(origins, np.float32(-np.inf)), origins)
     offsets = quantised(nodes - origins[:, None].astype(np.float64), np.uint16, lower=0.0)
     return PackedArray(origins), replace(offsets, delta=True)

@@ -1,4 +1,4 @@
-"""Arrays of a bundle: quantised or plain numbers, stored in byte planes and deflated (docs/concepts/bundle.md)."""
+"""Arrays of a bundle: quantised or plain numbers, stored as deflated byte planes (docs/concepts/bundle.md)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 TYPES = {name: np.dtype(name).newbyteorder("<") for name in ("uint8", "uint16", "uint32", "float32")}
 """Stored types by their names in the file; little-endian."""
 _MAX_RATIO = 1032
-"""Largest ratio of inflated to deflated bytes of RFC 1951."""
+"""Maximum ratio of inflated to deflated bytes that RFC 1951 allows."""
 
 
 @dataclass(frozen=True)
@@ -20,19 +20,19 @@ class PackedArray:
     """Numbers as a bundle stores them: ``lower + step * stored``, or ``stored`` without a step."""
 
     stored: np.ndarray
-    """(n, ...) of one of ``TYPES``."""
+    """(n, ...) stored numbers, of one of ``TYPES``."""
     lower: np.ndarray | None = None
-    """(m,) float64, along the last axis, or (1,)."""
+    """(m,) float64, values of the stored number 0 along the last axis, or (1,) for all; None without quantisation."""
     step: np.ndarray | None = None
-    """(m,) float64, along the last axis, or (1,)."""
+    """(m,) float64, quantisation steps along the last axis, or (1,) for all; None without quantisation."""
     error: float | None = None
-    """Largest absolute rounding error."""
+    """Maximum absolute rounding error; None without quantisation."""
     delta: bool = False
-    """True if the file stores the first item, then the difference of each item and the one before it."""
+    """True if the file stores the first item, and then the difference of each item from its predecessor."""
 
     @property
     def numbers(self) -> np.ndarray:
-        """(n, ...) the numbers, float64 if they are quantised."""
+        """Return the numbers (n, ...), float64 if they are quantised."""
         if self.lower is None or self.step is None:
             return self.stored
         return self.lower + self.step * self.stored
@@ -62,12 +62,12 @@ class PackedArray:
     def from_file(cls, entry: dict[str, Any], data: bytes) -> PackedArray:
         """Read the array that a JSON ``entry`` describes from the bytes of ``data``.
 
-        Raises ``ValueError`` if the bytes do not hold it.
+        Raises ``ValueError`` if the bytes do not contain such an array.
         """
         dtype, shape = TYPES[entry["type"]], entry["shape"]
         width = dtype.itemsize * math.prod(shape[1:])
         size = width * shape[0]
-        # Checked before anything is allocated.
+        # Check the size before anything is allocated.
         if size > _MAX_RATIO * len(data):
             raise ValueError(f"{len(data)} bytes cannot hold an array of shape {shape}")
         try:
@@ -96,21 +96,21 @@ def quantised(
     Args:
         values: finite numbers.
         dtype: ``np.uint8`` or ``np.uint16``.
-        step: Step, or steps along the last axis; None uses the smallest that covers the values, and so does a step that
-            is too small for them.
-        lower: Value of the number 0, as ``step``; None uses the minimum.
+        step: Step, or steps along the last axis. None, and steps with which ``dtype`` would overflow, are replaced by
+            the smallest step that covers the values.
+        lower: Value of the number 0, or values along the last axis; None uses the minimum.
     """
     rows = values.astype(np.float64)
     axes = tuple(range(rows.ndim - 1)) if rows.ndim > 1 else None
     low = np.atleast_1d(rows.min(axis=axes) if lower is None else np.asarray(lower, np.float64))
     smallest = np.atleast_1d(rows.max(axis=axes, initial=-np.inf) - low) / np.iinfo(dtype).max
     chosen = smallest if step is None else np.maximum(np.atleast_1d(np.asarray(step, np.float64)), smallest)
-    # All values are equal: any step will do.
+    # If all values are equal, any step is valid.
     chosen = np.where(chosen > 0.0, chosen, 1.0)
     stored = np.rint((rows - low) / chosen).astype(dtype)
     return PackedArray(stored, low, chosen, float(np.abs(low + chosen * stored - rows).max(initial=0.0)))
 
 
 def indices(values: np.ndarray) -> PackedArray:
-    """Store whole numbers, which are not negative, in 16 or 32 bits."""
+    """Pack non-negative integers in 16 or 32 bits."""
     return PackedArray(values.astype(np.uint16 if values.max(initial=0) <= 0xFFFF else np.uint32))

@@ -1,4 +1,4 @@
-"""Container of bundles: its JSON text, its arrays, and what is wrong with a file (docs/concepts/bundle.md)."""
+"""Container of bundles: its JSON text, its arrays, and the validation of files (docs/concepts/bundle.md)."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ VERSION = 1
 HEAD = struct.Struct("<4sII")
 """Magic bytes, version, and length of the JSON text in bytes."""
 BAND_ZERO = 128
-"""Stored value of a zero coefficient of the bands above 0."""
+"""Stored value of a zero SH coefficient above band 0."""
 _ROUNDING = 1.0 + 1e-3
-"""Factor on half a step that a stated error may reach, because steps are rounded to double precision."""
+"""Maximum ratio of a stated error to half a step; above 1, because steps are rounded to double precision."""
 _INDICES = ("cage_tets", "surface", "tets", "carriers", "arm_tets")
-"""Arrays that hold whole numbers."""
+"""Names of the arrays of integers."""
 
 
 class Carrier(IntEnum):
@@ -38,9 +38,9 @@ class Carrier(IntEnum):
     TET = 0
     """The affine map of one tetrahedron."""
     ARMS = 1
-    """The deformed arms of its axes, whose ends are in several tetrahedra (Eq. 14)."""
+    """The deformed arms of the Gaussian's axes, whose ends are in several tetrahedra (Eq. 14)."""
     RIGID = 2
-    """The rotation of one tetrahedron, far outside the cage."""
+    """The rotation of one tetrahedron, for Gaussians far outside the cage."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def read_valid_file(path: Path) -> BundleFile:
 
 
 def findings(path: Path) -> list[str]:
-    """Return what is wrong with a bundle, one line each; an empty list for a valid one.
+    """Return one line for each defect of a bundle; an empty list for a valid one.
 
     Raises ``UserError`` if the file cannot be read.
     """
@@ -72,7 +72,7 @@ def findings(path: Path) -> list[str]:
 
 
 def _read(data: bytes) -> tuple[BundleFile | None, list[str]]:
-    """Return the content of a bundle, None if it cannot be read, and what is wrong with it."""
+    """Return the content of a bundle, None if it cannot be read, and its defects."""
     if len(data) < HEAD.size or data[:4] != MAGIC:
         return None, [f"the file does not begin with {MAGIC.decode()}"]
     _, version, length = HEAD.unpack_from(data)
@@ -93,7 +93,7 @@ def _read(data: bytes) -> tuple[BundleFile | None, list[str]]:
     problems += _order_problems(text)
     end = 0
     stored: dict[str, PackedArray] = {}
-    # In the order of the file, in which a player receives them.
+    # Read the arrays in the order of the file, in which a player receives them.
     for place, entry in sorted(_entries(text), key=lambda item: item[1]["offset"]):
         if entry["offset"] < end:
             problems.append(f"{place}: its bytes overlap another array")
@@ -128,17 +128,17 @@ def _schema_problems(text: Any) -> Iterator[str]:
 
 @cache
 def _validator() -> Any:
-    # Slow to import, and only bundles need it.
+    # Imported here because the import is slow and only bundles need it.
     from jsonschema import Draft202012Validator, validators
 
-    # JSON Schema also counts 2.0 as an integer.
+    # In JSON Schema, 2.0 is also an integer.
     whole = Draft202012Validator.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
     schema = json.loads(resources.files("egs_warp.io").joinpath("bundle.schema.json").read_text("utf-8"))
     return validators.extend(Draft202012Validator, type_checker=whole)(schema)
 
 
 def _entries(text: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the place and the JSON object of every array."""
+    """Yield the location (for messages) and the JSON object of every array."""
     for number, body in enumerate(text["bodies"]):
         yield from ((f"bodies/{number}/{name}", entry) for name, entry in body["arrays"].items())
         for k, block in enumerate(body.get("blocks", ())):
@@ -157,7 +157,7 @@ def _order_problems(text: dict[str, Any]) -> Iterator[str]:
 
 
 def _number_problems(place: str, entry: dict[str, Any], array: PackedArray) -> Iterator[str]:
-    """Yield what is wrong with the numbers of one array."""
+    """Yield the defects in the numbers of one array."""
     if array.lower is None or array.step is None or array.error is None:
         if array.stored.dtype.kind == "f" and not np.isfinite(array.stored).all():
             yield "it has a value that is not finite"
@@ -181,7 +181,7 @@ def _body_problems(
     arrays: Mapping[str, PackedArray],
     blocks: tuple[Mapping[str, PackedArray], ...],
 ) -> Iterator[str]:
-    """Yield what does not fit together in one body."""
+    """Yield the inconsistencies between the arrays of one body."""
     count = body["count"]
     expected: dict[str, tuple[int, ...]] = {"means": (count, 3), "rotations": (count, 3), "log_scales": (count, 3)}
     expected |= {"opacities": (count,), "colours": (count, 3)}
@@ -217,7 +217,7 @@ def _body_problems(
 def _track_problems(
     body: dict[str, Any], frames: int, nodes: int, blocks: tuple[Mapping[str, PackedArray], ...]
 ) -> Iterator[str]:
-    """Yield what is wrong with the blocks of a body of ``nodes`` nodes."""
+    """Yield the defects in the blocks of a body of ``nodes`` nodes."""
     first, bound = 0, 0.0
     for number, (facts, block) in enumerate(zip(body["blocks"], blocks, strict=True)):
         place = f"blocks/{number}"
@@ -229,7 +229,7 @@ def _track_problems(
             if block[name].stored.shape != shape:
                 yield f"{place}: {name} has shape {list(block[name].stored.shape)}, not {list(shape)}"
         if block["nodes"].step is not None:
-            # Half a step in each of three directions.
+            # The bound is half a step in each of three directions.
             bound = max(bound, 0.5 * float(np.linalg.norm(np.broadcast_to(block["nodes"].step, 3))))
     if first != frames:
         yield f"its blocks have {first} frames, but the bundle has {frames}"

@@ -22,7 +22,7 @@ __all__ = ["PosedImage", "PosedImages", "read_cameras", "read_points", "read_pos
 
 
 def read_cameras(path: Path | str) -> list[PosedImage]:
-    """Read the valid cameras of ``read_posed_images``."""
+    """Read camera poses like ``read_posed_images``, and return only the valid cameras."""
     return list(read_posed_images(path).images)
 
 
@@ -31,9 +31,9 @@ def read_posed_images(path: Path | str) -> PosedImages:
 
     The formats are COLMAP sparse models (text or binary), INRIA's ``cameras.json``, the ``transforms.json`` of
     NeRF-synthetic and nerfstudio, the camera parameters of RealityScan (.csv) and the cameras of Metashape (.xml).
-    ``path`` is the file, the folder of a COLMAP model, or a folder that contains one of these; of several COLMAP models
-    the one with the most photos is read. Poses stay in the file's world frame, except that the offset of georeferenced
-    cameras of RealityScan and Metashape is subtracted; nerfstudio's ``applied_transform`` is not undone.
+    ``path`` is the file, the folder of a COLMAP model, or a folder that contains one of these. If there are several
+    COLMAP models, the one with the most photos is read. Poses stay in the world frame of the file, but the offset of
+    georeferenced cameras of RealityScan and Metashape is subtracted. nerfstudio's ``applied_transform`` is not undone.
 
     Raises ``UserError`` for missing or malformed files, and if no pose is valid.
     """
@@ -52,10 +52,10 @@ def read_posed_images(path: Path | str) -> PosedImages:
 
 
 def read_points(path: Path | str) -> SparsePoints | None:
-    """Read the points triangulated from the photos of ``path``; None if there are none.
+    """Read the points that were triangulated from the photos of ``path``; None if there are none.
 
-    They are COLMAP's, or the .ply that nerfstudio (``ply_file_path``) and INRIA (``input.ply``) place beside their
-    poses. Raises ``UserError`` for malformed files.
+    Their source is the COLMAP model, or the .ply beside the poses of nerfstudio (``ply_file_path``) and INRIA
+    (``input.ply``). Raises ``UserError`` for malformed files.
     """
     source = find_poses(Path(path)).path
     if source.is_dir():
@@ -74,8 +74,8 @@ def read_points(path: Path | str) -> SparsePoints | None:
 def _from_colmap(source: PoseSource) -> PosedImages:
     folder = source.path
     model = read_colmap_model(folder)
-    # COLMAP does not store the photos' folder; these are the common places around sparse/0. The photos of a model in
-    # ``distorted`` are those before the undistortion.
+    # COLMAP does not store the folder of the photos; these are the common locations relative to sparse/0. A model in
+    # ``distorted`` refers to the photos before the undistortion.
     is_distorted = "distorted" in folder.absolute().relative_to(source.root.absolute()).parts
     preferred = ("input",) if is_distorted else ()
     places = [source.root / name for name in preferred]

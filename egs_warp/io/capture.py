@@ -32,23 +32,24 @@ _META, _STREAMED_META = "meta.json", "lod-meta.json"
 
 @dataclass(frozen=True, kw_only=True)
 class Capture(GaussianCloud):
-    """A capture as read from disk, in the axes and units of its file, relative to its ``origin``: a cloud, with facts
-    about the file."""
+    """A capture as read from disk: a cloud with metadata of its file. Positions are in the axes and units of the file,
+    relative to ``origin``."""
 
     __repr__ = short_repr
 
     source: Path
     format: str
-    """Name for the user, such as ``.spz version 2``."""
+    """Name of the format for the user, such as ``.spz version 2``."""
     infinite_opacities: int
-    """Number of Gaussians whose opacity logit in the file is infinite (opacity 0 or 1) or beyond 500; read as -16 or
-    +16. Formats that store opacity in a byte have none, as their 0 and 255 stand for ranges."""
+    """Number of Gaussians whose opacity logit in the file is infinite (opacity 0 or 1) or beyond 500 in magnitude; such
+    logits are read as -16 or +16. It is 0 for formats that store opacity in a byte, whose 0 and 255 represent
+    ranges."""
     up: np.ndarray | None
     """(3,) float64 unit vector if the format or the file defines the up direction, else None."""
     vertical_axis: int | None
-    """Index of the vertical axis, if the file names one without a reliable sign."""
+    """Index of the vertical axis, if the file specifies one without a reliable sign."""
     notes: tuple[str, ...]
-    """Gaussians left out, and values repaired or rounded, for the user."""
+    """Notes for the user on Gaussians that were left out, and on values that were repaired or rounded."""
     origin: np.ndarray | None = None
     """(3,) float64, file units: offset of a georeferenced capture, which was subtracted from its positions."""
     rows: np.ndarray | None = None
@@ -56,25 +57,25 @@ class Capture(GaussianCloud):
 
     @property
     def cloud(self) -> GaussianCloud:
-        """The Gaussians alone."""
+        """The Gaussians without the metadata."""
         arrays = (self.means, self.rotations, self.log_scales, self.opacity_logits, self.sh)
         return GaussianCloud(*arrays, antialiased=self.antialiased)
 
     def cloud_aligned_with(self, other: Capture) -> GaussianCloud:
-        """Return the Gaussians alone, relative to the origin of ``other`` if both captures have one."""
+        """Return the Gaussians without the metadata, relative to the origin of ``other`` if both captures have one."""
         if self.origin is None or other.origin is None or np.array_equal(self.origin, other.origin):
             return self.cloud
         means = self.means.numpy() + (self.origin - other.origin)
         return replace(self.cloud, means=wp.array(means, dtype=wp.vec3, device=self.device))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the cloud, and the facts about the file."""
+        """Pickle the cloud and the metadata."""
         arrays = (*ARRAYS, "antialiased")
         facts = {one.name: getattr(self, one.name) for one in fields(self) if one.name not in arrays}
         return _capture, (self.cloud, facts)
 
     def subset(self, chosen: np.ndarray) -> Capture:
-        """Return the Gaussians that a boolean mask or an index array selects, with the facts about the file.
+        """Return the Gaussians that a boolean mask or an index array selects, with the metadata.
 
         Raises ``UserError`` if it selects none.
         """
@@ -87,7 +88,7 @@ class Capture(GaussianCloud):
 
 
 def _capture(cloud: GaussianCloud, facts: dict[str, Any]) -> Capture:
-    """Return the capture of ``cloud`` and ``facts``, its other fields."""
+    """Return the capture with the Gaussians of ``cloud`` and the other fields ``facts``."""
     return Capture(**{name: getattr(cloud, name) for name in (*ARRAYS, "antialiased")}, **facts)
 
 
@@ -95,11 +96,11 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
     """Read an INRIA or PlayCanvas compressed .ply, .spz, .splat, .sog, an unbundled SOG (its folder or meta.json), or
     glTF with splats (.glb, .gltf).
 
-    The format is determined by content; .splat, which has no magic number, and .gltf by their names. Raises
-    ``UserError`` with one line for anything that cannot be read.
+    The format is detected by content, except that .splat, which has no magic number, and .gltf are detected by name.
+    Raises ``UserError`` with one line for anything that cannot be read.
     """
     source = Path(path)
-    # Values too large for float32 and broken floats need no warning: they are left out and reported.
+    # Suppress warnings about values that are not finite or too large for float32, because they are reported below.
     with np.errstate(over="ignore", invalid="ignore"):
         raw = _decode(source)
     raw = without_outliers(without_not_finite(raw, source), source)
@@ -164,12 +165,12 @@ def _decode(source: Path) -> RawCapture:
 
 
 _MAGIC_NUMBERS = (b"NGSP", b"glTF", b"PK\x03\x04", b"\x1f\x8b\x08")
-"""First bytes that are a coordinate only by a rare coincidence."""
+"""Magic numbers of other formats, which the first coordinate of a .splat equals only by a rare coincidence."""
 
 
 def _may_be_splat(data: bytes, source: Path) -> bool:
-    """Return True if a file named .splat, which has no magic number, may be one: its first bytes are a coordinate, and
-    may equal those of zip, gzip or JSON."""
+    """Return True if a file named .splat may be one. The format has no magic number: its first bytes are a coordinate,
+    which may happen to equal the first bytes of zip, gzip or JSON."""
     whole = len(data) > 0 and len(data) % SPLAT_ROW == 0
     text = data[:1] == b"{" and data[:SPLAT_ROW].isascii() and b"\0" not in data[:SPLAT_ROW]
     return source.suffix.lower() == ".splat" and whole and not text and not data.startswith(_MAGIC_NUMBERS)
@@ -193,7 +194,7 @@ def _decode_meta(meta: Path) -> RawCapture:
 
 
 def _decode_zip(source: Path) -> RawCapture:
-    # zipfile raises a dozen classes of errors for corrupted archives; all mean the same to the user.
+    # zipfile raises a dozen classes of errors for corrupted archives; the user needs only one.
     try:
         with zipfile.ZipFile(source) as archive:
             members = {info.filename: info for info in archive.infolist() if not info.is_dir()}
@@ -204,7 +205,7 @@ def _decode_zip(source: Path) -> RawCapture:
                     f"{source}: a zip without meta.json; give a .sog, or unpack it if it holds another capture"
                 )
 
-            # Only requested members are inflated, and only to the size that was checked.
+            # Inflate only requested members, and only up to the checked size.
             def read(name: str) -> bytes:
                 inside = str(PurePosixPath(metas[0]).parent / _inside(name, source))
                 if inside not in members:

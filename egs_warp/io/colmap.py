@@ -44,7 +44,7 @@ _MODELS = {
 _PARAMETERS = {name: parameters.split() for name, parameters in _MODELS.values()}
 _IMAGE_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _IMAGE_START = 300
-"""Number of characters that contain the numbers of an image."""
+"""Number of characters at the beginning of a line that contain all numbers of an image."""
 _POINT_BYTES = 24
 """Bytes of one point in the list of a photo."""
 _TRACK_BYTES = 8
@@ -60,7 +60,7 @@ class _Intrinsics:
     cx: float
     cy: float
     lens: Lens | None
-    """Distortion of the photo; None for a pinhole."""
+    """Distortion of the photo; None for a pinhole camera."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ class ColmapView(_Intrinsics):
 
     name: str
     quaternion: np.ndarray
-    """(4,) w x y z, world to camera, far from zero."""
+    """(4,) w x y z, rotation from world to camera; not normalised, but not near zero."""
     translation: np.ndarray
-    """(3,) world to camera."""
+    """(3,) translation from world to camera, world units."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class ColmapModel:
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Points triangulated from the photos."""
+    """Points that were triangulated from the photos."""
 
     positions: np.ndarray
     """(n, 3) float64, world units."""
@@ -96,14 +96,14 @@ class SparsePoints:
 
 @dataclass(frozen=True)
 class _Camera:
-    """A camera as in the file. It is checked when a photo uses it."""
+    """A camera as stored in the file. It is checked only if a photo uses it."""
 
     model: str
     width: int
     height: int
     parameters: tuple[float, ...]
     line: int = 0
-    """Number of its line; 0 in binary files."""
+    """Line number of the camera; 0 in binary files."""
 
 
 @dataclass(frozen=True)
@@ -180,8 +180,8 @@ def _intrinsics(path: Path, number: int, camera: _Camera) -> _Intrinsics:
 
 
 def _text_lines(data: bytes, path: Path) -> Iterator[tuple[int, str]]:
-    """Return numbers and text of the lines that are neither empty nor comments, one at a time, as a list of all would
-    take far more memory than the file."""
+    """Yield number and text of each line that is neither empty nor a comment. A list of all lines would take far more
+    memory than the file."""
     lines = io.StringIO(decode_text(data, path))
     for number, line in enumerate(lines, start=1):
         text = line.strip()
@@ -203,7 +203,7 @@ def _text_cameras(data: bytes, path: Path) -> dict[int, _Camera]:
 
 
 def _camera_number(word: str) -> float:
-    """Return a number; NaN as Windows writes it, because a camera that no photo uses may have no values."""
+    """Parse a number, including NaN as Windows writes it, because a camera without photos may have no valid values."""
     try:
         return decimal_number(word)
     except ValueError:
@@ -213,12 +213,12 @@ def _camera_number(word: str) -> float:
 
 
 def _text_poses(data: bytes, path: Path) -> list[_Pose]:
-    """Read the poses. COLMAP writes a second line for each image, with its points; other tools leave it out or empty,
-    so that each line is classified by its content."""
+    """Read the poses. COLMAP writes a second line with points for each image, which other tools omit or leave empty.
+    Therefore each line is classified by its content."""
     poses = []
     may_be_points = False
     for at, line in _text_lines(data, path):
-        # Only the beginning is split: lines of points are long, and few begin like the line of an image.
+        # Split only the beginning: lines of points are long, and few of them begin like the line of an image.
         words = line[:_IMAGE_START].split(maxsplit=9)
         if may_be_points and not words[0].isdecimal() and _is_point_line(words[:3]):
             may_be_points = False
@@ -241,8 +241,8 @@ def _text_poses(data: bytes, path: Path) -> list[_Pose]:
 
 
 def _is_point_line(words: list[str]) -> bool:
-    """Return True for the points of an image: triples of two coordinates and a number, of which ``words`` are the first
-    nine and the rest."""
+    """Return True for a line with the points of an image: triples of two coordinates and an index. ``words`` are the
+    first nine words of the line, and the rest of the line."""
     try:
         for word in words[:9]:
             _camera_number(word)
@@ -250,7 +250,7 @@ def _is_point_line(words: list[str]) -> bool:
         return False
     if len(words) < 10:
         return len(words) % 3 == 0
-    # An image begins with a whole number, which few points do, and has a whole number and a name after the pose.
+    # The line of an image begins with an integer, unlike most points, and has an integer and a name after the pose.
     if not (words[0].isdecimal() and words[8].isdecimal()):
         return True
     rest = words[9].split()
@@ -261,7 +261,7 @@ def _is_point_line(words: list[str]) -> bool:
 
 
 class _Cursor:
-    """Reads a binary file sequentially."""
+    """Sequential reader of a binary file."""
 
     def __init__(self, data: bytes, path: Path) -> None:
         self.data = data
@@ -269,7 +269,7 @@ class _Cursor:
         self.offset = 0
 
     def take(self, layout: str) -> tuple:
-        """Return the next values of ``struct`` layout."""
+        """Return the next values in the ``struct`` format ``layout``."""
         try:
             values = struct.unpack_from("<" + layout, self.data, self.offset)
         except struct.error as error:
@@ -338,7 +338,7 @@ def _binary_records(cursor: _Cursor, *, with_points: bool) -> list[_Pose]:
 
 
 def _binary_points(data: bytes, path: Path) -> np.ndarray:
-    """(n, 6) position and colour."""
+    """Return position and colour (n, 6) of the points."""
     cursor = _Cursor(data, path)
     count = cursor.take("Q")[0]
     points = array("d")

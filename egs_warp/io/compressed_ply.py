@@ -42,13 +42,13 @@ _POSITION_FIELDS = ((21, 11), (11, 10), (0, 11))
 _ROTATION_FIELDS = ((20, 10), (10, 10), (0, 10))
 _COLOUR_FIELDS = ((24, 8), (16, 8), (8, 8))
 _SH_RANGE = 8.0
-# Other writers of this format clamp log scales here, so that one broken Gaussian does not spoil the precision of its
-# chunk.
+# Like other writers of this format, clamp log scales to this magnitude, so that one erroneous Gaussian does not spoil
+# the precision of its chunk.
 _SCALE_LIMIT = 20.0
 
 
 def is_compressed(header: PlyHeader) -> bool:
-    """Return True if ``header`` is that of a compressed .ply."""
+    """Return True if ``header`` belongs to a compressed .ply."""
     vertex = header.element("vertex")
     return (
         header.element("chunk") is not None
@@ -61,13 +61,13 @@ def is_compressed(header: PlyHeader) -> bool:
 def decode_compressed_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
     """Decode the Gaussians. Raises ``UserError`` for a file that is truncated or lacks a property."""
     sh_element = header.element("sh")
-    # At degree 0, gsplat writes an element without properties, and other programs write one without rows.
+    # At degree 0, gsplat writes an SH element without properties, and other programs write one without rows.
     has_rest = sh_element is not None and sh_element.count > 0 and (sh_element.dtype is None or sh_element.dtype.names)
     elements = read_elements(data, header, ["chunk", "vertex"] + (["sh"] if has_rest else []), source)
     chunk, vertex = elements.get("chunk"), elements.get("vertex")
     chunk_names = (chunk.dtype.names or ()) if chunk is not None else ()
     vertex_names = (vertex.dtype.names or ()) if vertex is not None else ()
-    # Files of 2023 have no bounds of colour; the range is then 0 ... 1.
+    # Files of 2023 have no bounds of colour; colours then range from 0 to 1.
     bounds = _BOUNDS if "min_r" in chunk_names else _BOUNDS[:12]
     missing = [n for n in bounds if n not in chunk_names] + [n for n in _PACKED if n not in vertex_names]
     if chunk is None or vertex is None or missing:
@@ -80,8 +80,7 @@ def decode_compressed_ply(data: bytes, header: PlyHeader, source: Path) -> RawCa
     limits = np.tile(np.array([0, 0, 0, 1, 1, 1], np.float32), (len(chunk), 3))
     limits[:, : len(bounds)] = columns_as_float32(chunk, bounds)
     limits = limits.reshape(-1, 3, 2, 3)[np.arange(len(vertex)) // _CHUNK]
-    # The words of a text .ply are float64, and those of a big-endian .ply have that byte order. Both represent the same
-    # integers.
+    # The packed integers of a text .ply are float64, and those of a big-endian .ply have its byte order.
     words = {name: vertex[name].astype(np.uint32) for name in _PACKED}
     means = _between(limits[:, 0], _fields(words["packed_position"], _POSITION_FIELDS))
     log_scales = _between(limits[:, 1], _fields(words["packed_scale"], _POSITION_FIELDS))
@@ -115,7 +114,7 @@ def _between(limits: np.ndarray, fraction: np.ndarray) -> np.ndarray:
 
 
 def _decode_rest(rows: np.ndarray, count: int, source: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return (n, 3 (K-1)) ``f_rest`` of the complete bands, channel by channel, and a note if others are left out."""
+    """Return ``f_rest`` (n, 3 (K-1)) of the complete bands, channel by channel, and a note if others are left out."""
     names = rows.dtype.names or ()
     if len(rows) != count or set(names) != {f"f_rest_{i}" for i in range(len(names))} or len(names) % 3:
         raise UserError(
@@ -135,7 +134,7 @@ def write_compressed_ply(path: Path | str, cloud: GaussianCloud, *, keep_order: 
     """Write ``cloud`` as a compressed .ply: about 16 bytes per Gaussian and one for each SH coefficient above band 0.
 
     The format is lossy: it rounds positions to 1/1024 of their chunk's size, SH to 1/32 and opacity to 1/255. Gaussians
-    are sorted in space, which keeps chunks small, unless ``keep_order`` is set. Returns (n,) the index in ``cloud`` of
+    are sorted in space, which keeps chunks small, unless ``keep_order`` is set. Returns the index (n,) in ``cloud`` of
     each Gaussian of the file. Raises ``UserError`` if the file cannot be written.
     """
     means = cloud.means.numpy()

@@ -1,4 +1,4 @@
-"""Differences between a capture and its copy in another format, each Gaussian compared with itself."""
+"""Differences between a capture and its copy in another format, measured Gaussian by Gaussian."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.capture import Capture
 
 _BLOCK_ROWS = 1 << 17
-"""Gaussians compared at a time, which bounds the memory."""
+"""Number of Gaussians that are compared at a time, which bounds the memory."""
 
 
 def conversion_loss(
     before: Capture, after: Capture, order: np.ndarray | None = None, *, origin: np.ndarray | None = None
 ) -> list[str]:
-    """Describe, line by line for the user, how ``after`` differs from ``before``.
+    """Return lines for the user that describe how ``after`` differs from ``before``.
 
     Args:
         before: The capture that was written.
-        after: The file, read back.
-        order: (n,) number in ``before`` of each Gaussian in the order of the file, as its writer returns it; None if
-            the order is the same.
-        origin: (3,) offset of ``before`` that the file includes (``stored_origin``); None without one.
+        after: The written file, read back.
+        order: (n,) index in ``before`` of each Gaussian of the file, as returned by its writer; None if the order is
+            the same.
+        origin: (3,) offset of ``before`` that the file includes (``stored_origin``); None if it includes none.
     """
     old, new = before.cloud, after.cloud
     order = np.arange(old.count) if order is None else order
@@ -58,13 +58,13 @@ def conversion_loss(
 
 
 class _Loss:
-    """Root mean square and largest value of one difference."""
+    """Root mean square and maximum of one kind of difference."""
 
     def __init__(self) -> None:
         self._squares, self._count, self._worst = 0.0, 0, 0.0
 
     def add(self, values: np.ndarray) -> None:
-        """Add differences of any shape, of at least 0."""
+        """Add non-negative differences of any shape."""
         self._squares += float(np.sum(values * values, dtype=np.float64))
         self._count += values.size
         self._worst = max(self._worst, float(values.max()))
@@ -98,7 +98,7 @@ def _differences(old: GaussianCloud, new: GaussianCloud, order: np.ndarray, shif
 
 
 class _Block(NamedTuple):
-    """Some Gaussians, as arrays of a ``GaussianCloud``."""
+    """Arrays of some Gaussians of a ``GaussianCloud``."""
 
     means: np.ndarray
     rotations: np.ndarray
@@ -110,8 +110,8 @@ class _Block(NamedTuple):
 def _blocks(
     old: GaussianCloud, new: GaussianCloud, order: np.ndarray, coefficients: int, shift: np.ndarray
 ) -> Iterator[tuple[_Block, _Block]]:
-    """Yield the same Gaussians of both clouds, with bands of colour that both have, and those of ``new`` moved by
-    ``shift`` (3,)."""
+    """Yield blocks of corresponding Gaussians of both clouds, with the SH bands that both have. The Gaussians of
+    ``new`` are moved by ``shift`` (3,)."""
     names = _Block._fields
     before, after = ([getattr(cloud, name).numpy() for name in names] for cloud in (old, new))
     before[-1], after[-1] = before[-1][:, :coefficients], after[-1][:, :coefficients]
@@ -132,14 +132,14 @@ def _position_errors(old: _Block, new: _Block) -> np.ndarray:
 
 
 def _size_errors(old: _Block, new: _Block) -> np.ndarray:
-    """Largest change of a standard deviation, percent of the Gaussian's largest one: a flat one that is a little less
-    flat looks the same."""
+    """Return the maximum change of a standard deviation, percent of the Gaussian's largest standard deviation, because
+    a slight change of the thickness of a flat Gaussian is not visible."""
     before, after = (np.exp(block.log_scales.astype(np.float64)) for block in (old, new))
     return 100.0 * np.abs(after - before).max(axis=1) / before.max(axis=1)
 
 
 def _rotation_errors(old: _Block, new: _Block) -> np.ndarray:
-    """Angles in degrees. A quaternion and its negative are the same rotation."""
+    """Return the angles between the rotations, degrees. A quaternion and its negative are the same rotation."""
     a, b = old.rotations.astype(np.float64), new.rotations.astype(np.float64)
     chord = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
     return 4.0 * np.degrees(np.arcsin(np.minimum(0.5 * chord, 1.0)))

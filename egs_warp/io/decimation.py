@@ -1,7 +1,7 @@
-"""Decimation of a capture: neighbours are merged into Gaussians with the moments of both.
+"""Decimation of a capture: pairs of neighbours are merged into Gaussians with the moments of the pairs.
 
-Pairs are neighbours along a Morton curve; the first to be merged are those that increase the weighted variance of
-positions and colours least (J. H. Ward, "Hierarchical grouping to optimize an objective function", 1963).
+Pairs are neighbours along a Morton curve. The pairs that increase the weighted variance of positions and colours least
+are merged first (J. H. Ward, "Hierarchical grouping to optimize an objective function", 1963).
 """
 
 from __future__ import annotations
@@ -19,23 +19,24 @@ _MIN_OPACITY, _MAX_OPACITY = 1e-6, 0.999
 _MERGED = -1
 _TINY = 1e-300
 _MIN_VARIANCE = 1e-14
-"""Smallest variance of a merged Gaussian, relative to its largest one: rounding can make the variance of a flat
-Gaussian negative."""
+"""Minimum variance of a merged Gaussian along an axis, relative to its maximum variance. Rounding could make the
+variance of a flat Gaussian negative."""
 _BLOCK_ROWS = 1 << 18
 
 
 def decimated(cloud: GaussianCloud, count: int) -> tuple[GaussianCloud, float]:
     """Merge Gaussians until ``count`` are left.
 
-    A Gaussian's weight is its opacity times the product of its two largest standard deviations. A pair becomes the
-    Gaussian with the mean and the covariance of both, the sum of their weights, and the mean of their colours.
+    The weight of a Gaussian is its opacity times the product of its two largest standard deviations. A pair is replaced
+    by a Gaussian with the weighted mean, the weighted covariance, the sum of the weights, and the weighted mean of the
+    colours.
 
     Args:
         cloud: The capture.
-        count: Number of Gaussians of the result, 1 to that of ``cloud``.
+        count: Number of Gaussians of the result, from 1 to the number in ``cloud``.
 
     Returns:
-        The merged capture, and the weighted root mean square of the distances by which Gaussians were moved, scene
+        The decimated capture, and the weighted root mean square of the distances by which Gaussians were moved, scene
         units.
     """
     means, covariances = cloud.means.numpy().astype(np.float64), _covariances(cloud)
@@ -67,7 +68,7 @@ def decimated(cloud: GaussianCloud, count: int) -> tuple[GaussianCloud, float]:
 
 
 def _covariances(cloud: GaussianCloud) -> np.ndarray:
-    """(n, 3, 3) float64."""
+    """Return the covariances (n, 3, 3) float64 of the Gaussians."""
     covariances = np.empty((cloud.count, 3, 3))
     quaternions, log_scales = cloud.rotations.numpy(), cloud.log_scales.numpy()
     for start in range(0, cloud.count, _BLOCK_ROWS):
@@ -79,7 +80,7 @@ def _covariances(cloud: GaussianCloud) -> np.ndarray:
 
 
 def _areas(covariances: np.ndarray) -> np.ndarray:
-    """(n,) product of the two largest standard deviations."""
+    """Return the products (n,) of the two largest standard deviations."""
     squares = np.maximum(np.linalg.eigvalsh(covariances), 0.0)
     return np.sqrt(squares[:, 1] * squares[:, 2])
 
@@ -106,7 +107,7 @@ def _cloud(
     log_scales[merged] = 0.5 * np.log(variances)
     logits[merged] = logit(np.clip(weights[merged] / areas, _MIN_OPACITY, _MAX_OPACITY))
     new = GaussianCloud.from_numpy(means, rotations, log_scales, logits, sh, device=str(cloud.device))
-    # Other properties of the cloud stay.
+    # Other properties of the cloud do not change.
     return replace(
         cloud,
         means=new.means,

@@ -15,7 +15,7 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp
 _BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
 _MARKS = (b"\x1a\x45\xdf\xa3", b"RIFF")
 _SHARPNESS_SIDE = 480
-"""Longer side in pixels to which a frame is reduced before its sharpness is measured, so that noise contributes less
+"""Longer side in pixels to which a frame is downscaled before its sharpness is measured, so that noise contributes less
 than edges."""
 
 
@@ -24,15 +24,16 @@ class Frame:
     """One frame of a video."""
 
     number: int
-    """Index from 0."""
+    """Index of the frame, from 0."""
     pixels: np.ndarray
     """(H, W, 3) uint8, BGR, upright."""
     sharpness: float
-    """Variance of the Laplacian."""
+    """Variance of the Laplacian of the downscaled frame."""
 
 
 def select_sharp_frames(video: Path, count: int) -> Iterator[Frame]:
-    """Yield the sharpest frame of each of ``count`` equal parts of the ``video``; all frames if it has fewer.
+    """Yield the sharpest frame of each of ``count`` equal parts of the ``video``; all frames if it has at most
+    ``count``.
 
     Raises ``UserError`` for a file that is not a video.
     """
@@ -54,7 +55,8 @@ def select_sharp_frames(video: Path, count: int) -> Iterator[Frame]:
 
 
 def _check(video: Path) -> None:
-    """Reject files whose first bytes are not those of a video: a playlist could open other files and addresses."""
+    """Raise ``UserError`` if the first bytes are not those of a video, because a playlist could refer to other files
+    and addresses."""
     if not video.is_file():
         raise UserError(f"{video}: no such file; give a video or a folder of photos")
     try:
@@ -62,8 +64,8 @@ def _check(video: Path) -> None:
             start = file.read(12)
     except OSError as error:
         raise UserError(f"{video}: cannot be read ({error.strerror}); check the path") from error
-    # QuickTime and MPEG-4 begin with a size and a name, Matroska and RIFF with a magic number, transport streams with a
-    # G.
+    # QuickTime and MPEG-4 begin with a size and a name, Matroska and RIFF with a magic number, transport streams with
+    # the letter G.
     if not (start[4:8] in _BOXES or start[:4] in _MARKS or start[:1] == b"G" or start[4:5] == b"G"):
         raise UserError(f"{video}: not a readable video; give an .mp4 or .mov, or a folder of photos")
 

@@ -1,7 +1,7 @@
 """Writing of binary glTF 2.0 with splats as points: KHR_gaussian_splatting, as ratified.
 
-Scales and opacities are stored directly, not as logarithms; quaternions are x, y, z, w. glTF's y axis is up, which the
-caller must provide.
+Scales and opacities are stored directly, not as logarithms; quaternions are x, y, z, w. In glTF, the y axis is up; the
+caller must provide such captures.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def write_glb(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | No
     splats: dict[str, object] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
     if cloud.antialiased:
-        # The extension has no property for it.
+        # The extension has no property for antialiasing.
         splats |= {"extras": {"antialiased": True}}
     node: dict[str, object] = {"mesh": 0, "name": "creature"}
     if origin is not None:

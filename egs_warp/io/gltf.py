@@ -1,8 +1,8 @@
-"""Reading of glTF 2.0 with splats: KHR_gaussian_splatting as ratified, in one .glb, or a .gltf with its buffers beside
-it.
+"""Reading of glTF 2.0 with splats: KHR_gaussian_splatting as ratified, in one .glb, or in a .gltf with separate
+buffers.
 
-Splats may be packed by KHR_gaussian_splatting_compression_spz_2 (a .spz in a buffer view). Required extensions that are
-not read are refused, as glTF demands. See https://github.com/KhronosGroup/glTF/tree/main/extensions.
+Splats may be compressed with KHR_gaussian_splatting_compression_spz_2 (a .spz in a buffer view). As glTF demands, files
+that require an unsupported extension are rejected. See https://github.com/KhronosGroup/glTF/tree/main/extensions.
 """
 
 from __future__ import annotations
@@ -28,31 +28,31 @@ from egs_warp.io.text import parse_json
 
 EXTENSION = "KHR_gaussian_splatting"
 _SPZ = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
-"""Packing by a .spz, as of the draft and as earlier files name it."""
+"""Extensions for compression as .spz: the name in the draft, and the name in earlier files."""
 _SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
-"""Draft of 2025, in place of ``EXTENSION``."""
+"""Extension of a draft of 2025, which is used instead of ``EXTENSION``."""
 _QUANTIZED = "KHR_mesh_quantization"
 _READ = (EXTENSION, *_SPZ, _SPZ_ALONE, INSTANCING, _QUANTIZED)
 _SURFACES = ("KHR_materials_", "EXT_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
-"""Beginnings of the names of extensions that change only how meshes look."""
+"""Prefixes of extensions that only change the appearance of meshes."""
 _MAX_COPIES = 1 << 21
 """Maximum number of Gaussians that instances add to those of the file."""
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
-"""Numbers of a .glb: its first one, and the kinds of its two chunks."""
+"""Magic number of a .glb, and types of its two chunks."""
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _HALF_TURN = np.diag([-1.0, 1.0, -1.0])
-"""Turn about y: from right, up, back, the axes of .spz, to left, up, front."""
+"""Half a turn about y: from the axes of .spz (right, up, back) to left, up, front."""
 _Y_UP = np.array([0.0, 1.0, 0.0])
 
 
 def is_glb(data: bytes) -> bool:
-    """Return True if ``data`` begins as a binary glTF."""
+    """Return True if ``data`` begins like a binary glTF file."""
     return data[:4] == b"glTF"
 
 
 def decode_glb(data: bytes, source: Path) -> RawCapture:
-    """Decode a .glb. Raises ``UserError`` for a damaged one, or one without splats of a supported kind."""
+    """Decode a .glb. Raises ``UserError`` for a damaged file, and for a file without splats of a supported kind."""
     if len(data) < 20 or int.from_bytes(data[4:8], "little") != 2:
         raise UserError(f"{source}: not a .glb file of version 2, or truncated; export it again")
     chunks: dict[int, bytes] = {}
@@ -76,7 +76,7 @@ def decode_glb(data: bytes, source: Path) -> RawCapture:
 
 
 def decode_gltf(text: bytes, source: Path) -> RawCapture:
-    """Decode a .gltf with buffers beside it or embedded. Raises ``UserError`` as ``decode_glb``."""
+    """Decode a .gltf with separate or embedded buffers. Raises ``UserError`` like ``decode_glb``."""
 
     def read(_: int, uri: str | None) -> bytes | None:
         return None if uri is None else _buffer(uri, source)
@@ -100,7 +100,7 @@ def _decode(text: bytes, source: Path, read: Callable[[int, str | None], bytes |
     try:
         tree = parse_json(text.decode("utf-8"), source)
         return _Asset(source, tree, read).capture()
-    # An untrusted tree may contain anything anywhere; all deviations from glTF end here.
+    # An untrusted tree may deviate from glTF anywhere; all these errors are handled here.
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         if isinstance(error, UserError):
             raise
@@ -112,20 +112,20 @@ class _Splats:
     """Splats of one primitive, in the axes of its mesh."""
 
     means: np.ndarray
-    """(n, 3) float32, or float64 once transformed."""
+    """(n, 3) float32, or float64 after a transform."""
     rotations: np.ndarray
-    """(n, 4) float32, w x y z."""
+    """(n, 4) float32, quaternions w x y z."""
     log_scales: np.ndarray
-    """(n, 3) float32."""
+    """(n, 3) float32, logarithms of the standard deviations."""
     opacity_logits: np.ndarray
-    """(n,) float32."""
+    """(n,) float32, logits of the opacities."""
     sh: np.ndarray
-    """(n, K, 3) float32."""
+    """(n, K, 3) float32, SH coefficients, band 0 first."""
     antialiased: bool = False
     notes: tuple[str, ...] = ()
 
     def transformed(self, transform: np.ndarray) -> _Splats:
-        """Return the splats after the (4, 4) affine ``transform``."""
+        """Return the splats after the affine ``transform`` (4, 4)."""
         matrix = transform[:3, :3]
         means = self.means.astype(np.float64) @ matrix.T + transform[:3, 3]
         finite = np.isfinite(self.rotations).all(axis=1) & np.isfinite(self.log_scales).all(axis=1)
@@ -140,10 +140,11 @@ class _Asset:
     source: Path
     tree: dict[str, Any]
     read: Callable[[int, str | None], bytes | None]
-    """Return the bytes of a buffer, by its number and uri; None if the file does not contain it."""
+    """Function that returns the bytes of a buffer by its index and URI; None if the file does not contain it."""
 
     def capture(self) -> RawCapture:
-        """Return all splats of the file: in the axes of their mesh if they share them, else in those of the scene."""
+        """Return all splats of the file: in the axes of their meshes if all meshes have the same transform, a rotation
+        and scale, otherwise in the axes of the scene."""
         self._check_required()
         meshes = self.tree.get("meshes", [])
         splats = [[p for p in mesh["primitives"] if _is_splats(p)] for mesh in meshes]
@@ -239,8 +240,8 @@ class _Asset:
     def _packed(self, primitive: dict[str, Any], packed: dict[str, Any]) -> _Splats:
         """Decode a .spz.
 
-        It is in the axes of the mesh or, as the draft demands and few tools do, turned about y; the bounds of
-        ``POSITION`` tell which.
+        Its axes are those of the mesh or, as the draft demands and few tools implement, rotated about y. The bounds of
+        ``POSITION`` decide between both.
         """
         view = self.tree["bufferViews"][packed["bufferView"]]
         start, size = view.get("byteOffset", 0), view["byteLength"]
@@ -296,7 +297,7 @@ class _Asset:
             elif degree < len(SH_COUNTS):
                 sh += [of(name) for name in names]
         if (scales < 0.0).any():
-            # A review draft of the extension stored the logarithms of scales.
+            # In a review draft of the extension, scales were stored as logarithms.
             notes.append("scales are negative: read as logarithms")
             log_scales = scales
         else:
@@ -312,7 +313,7 @@ class _Asset:
         )
 
     def _accessor(self, number: int) -> np.ndarray:
-        """(n, width) float32, unpacked according to the standard."""
+        """Return the values (n, width) float32 of an accessor, unpacked according to the standard."""
         accessor = self.tree["accessors"][number]
         if "sparse" in accessor or "bufferView" not in accessor:
             kind = "sparse" if "sparse" in accessor else "without data"

@@ -1,4 +1,4 @@
-"""Nodes of glTF: where the scene places each of its meshes, with instances."""
+"""Nodes of glTF: the placement of meshes in the scene, with instances."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from egs_warp.errors import UserError
 
 INSTANCING = "EXT_mesh_gpu_instancing"
 _FLAT = 1e-9
-"""Ratio of the smallest to the largest singular value up to which a transform counts as singular."""
+"""Ratio of the smallest to the largest singular value up to which a transform is considered singular."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """One mesh in the scene."""
+    """Placement of one mesh in the scene."""
 
     mesh: int
     transforms: np.ndarray
-    """(k, 4, 4) from the mesh to the scene, one for each instance."""
+    """(k, 4, 4) affine transforms from the mesh to the scene, one for each instance."""
 
 
 def placements(
     tree: dict[str, Any], source: Path, accessor: Callable[[int], np.ndarray], is_wanted: Callable[[int], bool]
 ) -> list[Placement]:
-    """Return the wanted meshes of the scene that is shown by default, in the order of its nodes.
+    """Return the placements of the wanted meshes in the default scene, in the order of its nodes.
 
-    A file without scenes, or whose scene shows no wanted mesh, shows all of its nodes; a mesh without any node is
+    If there are no scenes, or the default scene contains no wanted mesh, all nodes are used. A mesh without any node is
     placed by the identity.
 
     Args:
         tree: JSON tree of the file.
         source: name for messages.
-        accessor: returns the values (n, width) of an accessor.
-        is_wanted: returns True for the index of a mesh that is to be placed.
+        accessor: function that returns the values (n, width) of an accessor by its index.
+        is_wanted: function that returns True for the index of a wanted mesh.
 
     Raises:
         UserError: the nodes do not form a tree, or a transform is singular or not finite.
@@ -100,7 +100,7 @@ def _placed(
 
 
 def _instances(attributes: dict[str, int], accessor: Callable[[int], np.ndarray]) -> np.ndarray:
-    """(k, 4, 4) transforms of the instances of a node."""
+    """Return the transforms (k, 4, 4) of the instances of a node."""
     values = {name: accessor(attributes[name]) for name in ("TRANSLATION", "ROTATION", "SCALE") if name in attributes}
     counts = {len(value) for value in values.values()}
     if len(counts) != 1:

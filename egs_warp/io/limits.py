@@ -18,7 +18,7 @@ from egs_warp.errors import UserError, did_you_mean
 MAX_TEXT_BYTES = 32 << 20
 """Maximum size of JSON and other text in bytes; once parsed, it takes about thirty times as much memory."""
 MAX_PIXELS = 178_956_970
-"""Maximum number of pixels of a picture or camera: Pillow's own limit."""
+"""Maximum number of pixels of a picture or camera, which is Pillow's limit."""
 MAX_SIDE = 1 << 15
 """Maximum side of a picture or camera, pixels."""
 
@@ -26,9 +26,9 @@ MAX_SIDE = 1 << 15
 MAX_COORDINATE = 1e12
 """Maximum coordinate, scene units."""
 MIN_LOG_SCALE = -100.0
-"""Minimum logarithm of a standard deviation; below it, exp is 0 in single precision."""
+"""Minimum logarithm of a standard deviation; its exponential is nearly 0 in single precision."""
 FREE_GAUSSIANS = 1 << 16
-"""Number of Gaussians that a packed capture of any size may declare."""
+"""Number of Gaussians that a packed capture may declare whatever its size."""
 INFLATION = 4
 """Maximum ratio of inflated to packed bytes of a picture in a zip, in addition to ``FREE_BYTES``; WebP is hardly
 compressible."""
@@ -36,8 +36,8 @@ FREE_BYTES = 1 << 16
 
 
 def check_count(count: int, size: int, source: Path) -> None:
-    """Raise ``UserError`` for more Gaussians than a packed file of ``size`` bytes can contain: positions need at least
-    a byte each."""
+    """Raise ``UserError`` for more Gaussians than a packed file of ``size`` bytes can contain, because each position
+    needs at least one byte."""
     if count > size + FREE_GAUSSIANS:
         raise UserError(f"{source}: it declares {count} Gaussians in {size} bytes; copy or export it again")
 
@@ -57,7 +57,7 @@ def picture_size(data: bytes | Path, what: str) -> tuple[int, int] | None:
     """
     from PIL import Image
 
-    # Pillow warns of large pictures before this limit applies.
+    # Pillow would warn of large pictures below this limit.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -65,7 +65,7 @@ def picture_size(data: bytes | Path, what: str) -> tuple[int, int] | None:
                 return image.size
         except Image.DecompressionBombError:
             raise UserError(f"{what} has more than {MAX_PIXELS} pixels; make it smaller") from None
-        # The decoder reads untrusted bytes, and its errors share no base class.
+        # The decoder reads untrusted bytes, and its errors have no common base class.
         except Exception:
             return None
 
@@ -97,20 +97,20 @@ def read_bytes(path: Path | str, *, at_most: int | None = None, missing: str = "
         raise UserError(f"{path}: is a folder; give a file") from error
     except UserError:
         raise
-    # ValueError: a path with a null byte.
+    # A path with a null byte raises ValueError.
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise UserError(f"{path}: cannot be read ({reason}); check the path and its permissions") from error
 
 
 def missing_error(path: Path | str, advice: str = "check the path") -> UserError:
-    """Return the error about a missing ``path``, with the name in its folder that may be meant."""
+    """Return the error about a missing ``path``, with the most similar name in its folder, if any."""
     missing = Path(path)
     try:
         names = sorted(os.listdir(missing.parent))
     except (OSError, ValueError):
         names = []
-    # Names that share only their suffix are not alike.
+    # Names with only their suffix in common are not similar.
     stem = missing.stem.lower()
     names = [name for name in names if difflib.SequenceMatcher(None, stem, Path(name).stem.lower()).ratio() > 0.6]
     return UserError(f"{path}: no such file or folder{did_you_mean(missing.name, names)}; {advice}")

@@ -1,7 +1,7 @@
 """Cameras of Agisoft Metashape (*Export Cameras*, .xml).
 
-A camera's ``transform`` maps its OpenCV axes to the chunk, and the ``transform`` of the chunk or component maps these
-to the world. The lens model is that of the appendix of the user manual; its P1 and P2 are OpenCV's p2 and p1.
+The ``transform`` of a camera maps OpenCV axes to the chunk, and the ``transform`` of the chunk or component maps the
+chunk to the world. The appendix of the user manual describes the lens model; its P1 and P2 are OpenCV's p2 and p1.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ from egs_warp.io.posed_images import (
 )
 
 _TYPES = {"frame": False, "fisheye": True, "equidistant_fisheye": True}
-"""Types of sensors that are read, and whether their polynomial is in the angle."""
+"""Supported types of sensors. The value is True if the argument of the distortion polynomial is the angle."""
 _MAX_SKEW = 1.0
 """Skew that is ignored without a note, pixels."""
 _EXPORT = "export the cameras again as XML"
 
 
 def read_metashape(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], list[ExcludedPhoto], list[str]]:
-    """Read the aligned cameras of a .xml, find their photos and masks in ``files``, and return notes for the user.
+    """Read the aligned cameras of a .xml, and find their photos and masks in ``files``.
 
-    Of several chunks, the one with the most aligned cameras is read. Raises ``UserError`` for a file that is malformed
-    or has no valid camera.
+    If there are several chunks, the one with the most aligned cameras is read. Returns the photos with valid cameras,
+    the excluded photos, and notes for the user. Raises ``UserError`` for a file that is malformed or has no valid
+    camera.
     """
     data = read_bytes(source, at_most=MAX_TEXT_BYTES)
     # A document type declaration can define entities that expand to any size.
@@ -138,8 +139,8 @@ def _intrinsics(entry: _Entry) -> tuple[dict, Lens | None]:
     }
     if not np.isfinite(list(number.values())).all() or width < 1 or height < 1:
         raise UserError(f"{entry.where} has a sensor with invalid numbers; {_EXPORT}")
-    # Up to version 1.2, files have two focal lengths, the principal point itself instead of its offset from the middle,
-    # and p1 and p2 in OpenCV's order.
+    # Up to version 1.2, files have two focal lengths, the position of the principal point instead of its offset from
+    # the middle, and p1 and p2 in OpenCV's order.
     is_old = calibration.find("fx") is not None
     intrinsics = {
         "width": width,
@@ -156,13 +157,13 @@ def _intrinsics(entry: _Entry) -> tuple[dict, Lens | None]:
 
 
 def _calibration(sensor: ElementTree.Element | None) -> ElementTree.Element | None:
-    """Return the calibration of a sensor: the adjusted one, if there are several."""
+    """Return the calibration of a sensor; if there are several, the adjusted one."""
     found = [] if sensor is None else sensor.findall("calibration")
     return next((one for one in found if one.get("class") == "adjusted"), found[0] if found else None)
 
 
 def _calibration_number(sensor: ElementTree.Element | None, name: str) -> float:
-    """Return a number of the calibration; 0 if it is missing, NaN if it is not a number."""
+    """Return the value ``name`` of the calibration; 0 if it is missing, NaN if it is not a number."""
     calibration = _calibration(sensor)
     text = None if calibration is None else calibration.findtext(name)
     try:

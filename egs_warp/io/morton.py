@@ -1,4 +1,4 @@
-"""Order along a space-filling curve: neighbours in space become neighbours in the file."""
+"""Order along a space-filling curve, in which neighbours in the file are neighbours in space."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ _BITS = 16
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
-    """(n,) permutation that sorts ``points`` (n, 3) along a Morton curve of 2^16 cells per side; stable."""
+    """Return the permutation (n,) that sorts ``points`` (n, 3), stably, along a Morton curve of 2^16 cells per side."""
     points = points.astype(np.float64)
     low = points.min(axis=0)
     extent = np.maximum(points.max(axis=0) - low, 1e-300)

@@ -1,5 +1,5 @@
-"""Output files that are named one by one and belong to one run: they are locked while it writes them, and those of an
-earlier run are backed up."""
+"""Output files of one run that have individual names: they are locked during the run, and files of an earlier run are
+backed up."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from egs_warp.io.run_folder import back_up, check_out
 
 
 class NamedFiles:
-    """Files that one run writes, created by ``named_files``."""
+    """Output files of one run, created by ``named_files``."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._paths = paths
 
     def begin(self) -> None:
-        """Back up existing files; called when all files are about to be written."""
+        """Back up existing files; call it when all files are about to be written."""
         for folder in dict.fromkeys(path.parent for path in self._paths):
             back_up(folder, [path.name for path in self._paths if path.parent == folder])
 
 
 @contextmanager
 def named_files(*paths: Path, overwrite: bool = False) -> Iterator[NamedFiles]:
-    """Lock the files ``paths`` for one run; the user has named the first one. Missing folders are created.
+    """Lock the files ``paths`` for one run; the user has chosen the name of the first one. Create missing folders.
 
-    Raises ``UserError`` if another run is writing the first file, or if one of them exists and may not be backed up
+    Raises ``UserError`` if another run is writing the first file, or if a file exists and may not be backed up
     (``overwrite``).
     """
     check_named_files(*paths, overwrite=overwrite)
@@ -42,7 +42,7 @@ def named_files(*paths: Path, overwrite: bool = False) -> Iterator[NamedFiles]:
         # Files may have been created between the check and the lock.
         check_named_files(*paths, overwrite=overwrite)
         yield NamedFiles(paths)
-        # Leftovers of a killed run that were too young to be distinguished from those of a running one.
+        # Remove leftovers of a killed run that were too young before to be distinguished from files of a running one.
         for folder in folders:
             sweep_all(folder)
 

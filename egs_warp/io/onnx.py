@@ -1,7 +1,7 @@
-"""Structure of ONNX files, as far as it is needed to trust them.
+"""Checks of ONNX files before they are loaded.
 
 Public description: https://onnx.ai/onnx/repo-docs/IR.html and ``onnx.proto``. An ONNX file contains numbers and a graph
-of known operations, no code. Its tensors may be in other files that it names; this is rejected.
+of known operations, but no code. Files with references to other files for their tensors are rejected.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from egs_warp.errors import UserError
 from egs_warp.io.limits import read_bytes
 
 MAX_NETWORK_BYTES = 2 << 30
-"""Maximum size in bytes, which is the limit of protocol buffers."""
+"""Maximum size of a file in bytes, which is the limit of protocol buffers."""
 _MAX_DEPTH = 32
-"""Maximum depth of graphs in attributes of graphs."""
+"""Maximum nesting depth of graphs in attributes of graphs."""
 # For each kind of message, the numbers and kinds of the fields that may contain tensors.
 _MESSAGES = {
     "Model": {7: "Graph", 20: "Training", 25: "Function"},
@@ -28,7 +28,7 @@ _MESSAGES = {
     "SparseTensor": {1: "Tensor", 2: "Tensor"},
 }
 _EXTERNAL_DATA, _DATA_LOCATION = 13, 14
-"""Fields of a tensor that give the location of its data outside the file."""
+"""Field numbers of a tensor for the location of its data outside the file."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def read_onnx(path: Path) -> OnnxFile:
 
 
 class _Walk:
-    """Traversal of all tensors. Malformed data raise ``IndexError``."""
+    """Traversal of all tensors of a file. Malformed data raise ``IndexError``."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -90,7 +90,7 @@ def _text(value: memoryview | int) -> str:
 
 
 def _fields(data: memoryview) -> Iterator[tuple[int, memoryview | int]]:
-    """Yield number and value of each field of a protocol buffer; fixed-width values as bytes."""
+    """Yield number and value of each field of a protocol buffer; values of fixed width are bytes."""
     place = 0
     while place < len(data):
         key, place = _varint(data, place)

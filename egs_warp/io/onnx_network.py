@@ -25,14 +25,14 @@ class OnnxNetwork:
     inputs: tuple[str, ...]
     """Names of the inputs."""
     compute: Callable[[Inputs], list[np.ndarray]]
-    """Function that computes all outputs, in the file's order. It raises the errors of onnxruntime or OpenCV."""
+    """Function that computes all outputs in the order of the file. It raises errors of onnxruntime or OpenCV."""
 
     def run(self, inputs: Inputs, *, expected: str) -> list[np.ndarray]:
         """Compute all outputs, in the file's order. Raises ``UserError`` on failure; the message recommends the file
         ``expected``."""
         try:
             return [np.asarray(value) for value in self.compute(inputs)]
-        # Errors of OpenCV and onnxruntime share no base class.
+        # Errors of OpenCV and onnxruntime have no common base class.
         except Exception as error:
             shapes = ", ".join(f"{name} {value.shape}" for name, value in inputs.items())
             raise UserError(

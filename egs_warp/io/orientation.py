@@ -1,4 +1,4 @@
-"""Orientation of pictures, as cameras store it in EXIF."""
+"""Orientation of pictures that cameras store in EXIF."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ _ORIENTATION = 0x0112
 
 
 def orientation(image: Path) -> int:
-    """Return the orientation that the file requests: EXIF's 1 (unchanged) to 8."""
+    """Return the EXIF orientation of the file, 1 (unchanged) to 8."""
     from PIL import Image
 
     try:
         with Image.open(image) as opened:
             turn = opened.getexif().get(_ORIENTATION, 1)
-    # The decoder reads untrusted bytes, and its errors share no base class.
+    # The decoder reads untrusted bytes, and its errors have no common base class.
     except Exception:
         return 1
     return turn if turn in range(1, 9) else 1
 
 
 def apply_orientation(pixels: np.ndarray, turn: int) -> np.ndarray:
-    """Return ``pixels`` (H, W, ...) in EXIF's orientation ``turn``."""
+    """Return ``pixels`` (H, W, ...) rotated and mirrored according to the EXIF orientation ``turn``."""
     if turn >= 5:
         pixels = pixels.swapaxes(0, 1)
-    # Directions in which the axes are read after the swap.
+    # Directions in which rows and columns are read after the axes have been swapped.
     rows = -1 if turn in (3, 4, 7, 8) else 1
     columns = -1 if turn in (2, 3, 6, 7) else 1
     return np.ascontiguousarray(pixels[::rows, ::columns])

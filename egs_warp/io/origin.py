@@ -1,6 +1,6 @@
-"""Positions of georeferenced captures: a capture far from its origin is kept relative to a point amid its Gaussians.
+"""Positions of georeferenced captures: a capture far from its origin is stored relative to a point in its middle.
 
-Coordinates of a map, such as 5403000 m north, leave single precision steps of half a metre.
+In single precision, map coordinates such as 5403000 m north have a resolution of half a metre.
 """
 
 from __future__ import annotations
@@ -8,22 +8,22 @@ from __future__ import annotations
 import numpy as np
 
 MAX_ROUNDING = 2.0**-16
-"""Largest error of positions in single precision, relative to the size of the capture, up to which no origin is
-subtracted."""
+"""Maximum rounding error of positions in single precision, relative to the size of the capture, without an origin; if
+it is larger, an origin is subtracted."""
 _SAMPLES = 200_000
-"""Gaussians, spread evenly, from which the size of a capture is measured."""
+"""Number of evenly chosen Gaussians from which the size of a capture is measured."""
 COARSE_STEP = 2.0**-10
-"""Step of single precision, relative to the size of the capture, above which it is reported."""
+"""Resolution of single precision, relative to the size of the capture, above which there is a note."""
 
 
 def relative_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
-    """Return positions in single precision, the origin that they are relative to, and notes for the user.
+    """Return positions in single precision, relative to an origin if necessary.
 
     Args:
-        means: (n, 3) float32 or float64, n > 0, finite.
+        means: (n, 3) float32 or float64, finite positions, n > 0.
 
     Returns:
-        Positions (n, 3) float32; the origin (3,) float64 that was subtracted, or None; and the notes.
+        Positions (n, 3) float32; the origin (3,) float64 that was subtracted, or None; and notes for the user.
     """
     some = means[:: -(-len(means) // _SAMPLES)].astype(np.float64)
     middle = np.median(some, axis=0)
@@ -32,7 +32,7 @@ def relative_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray | None
     step = float(np.spacing(np.float32(np.abs(middle).max())))
     rounded, error = _rounded(means)
     if size > 0.0 and error > MAX_ROUNDING * size:
-        # A multiple of a power of two has few digits, and is subtracted without an error.
+        # A multiple of a power of two has few digits and is subtracted without rounding.
         unit = 2.0 ** np.floor(np.log2(size))
         origin = unit * np.rint(middle / unit)
         rounded, error = _rounded(means - origin)
@@ -48,7 +48,7 @@ def relative_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray | None
 
 
 def _rounded(means: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return ``means`` in single precision, and the largest error."""
+    """Return ``means`` in single precision, and the maximum rounding error."""
     rounded = means.astype(np.float32, copy=False)
     if means.dtype == np.float32:
         return rounded, 0.0

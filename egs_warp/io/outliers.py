@@ -1,7 +1,7 @@
 """Erroneous Gaussians of a capture: not finite, far away, much larger than the capture, or brighter than any light.
 
-One of them is enough to stall a simulation or to overflow single precision. Outliers are found by bounds that such
-Gaussians do not affect (medians), left out, and reported.
+A single outlier can stall a simulation or overflow single precision. Outliers are detected by bounds that they do not
+affect (medians), left out, and reported.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from egs_warp.io.limits import MAX_COORDINATE, MIN_LOG_SCALE
 from egs_warp.io.raw import RawCapture, property_names
 
 MAX_DISTANCE_RATIO = 1e4
-"""Maximum distance from the capture's middle, in sizes of the capture; a sky can be hundreds of sizes away."""
+"""Maximum distance from the middle of the capture, in sizes of the capture; a sky can be hundreds of sizes away."""
 MAX_SCALE_RATIO = 1e2
 """Maximum standard deviation of a Gaussian, in sizes of the capture."""
 MAX_SH = 1e3
-"""Maximum coefficient of a colour; that of a white surface is 1.8."""
+"""Maximum SH coefficient; the coefficient of a white surface is 1.8."""
 MAX_LOGIT = 500.0
-"""An opacity logit beyond this is treated as infinite."""
+"""Magnitude of an opacity logit above which it is treated as infinite."""
 _MAX_OUTLIER_FRACTION = 0.5
 _SHOWN = 3
 
 
 def without_not_finite(raw: RawCapture, source: Path) -> RawCapture:
-    """Return ``raw`` without the Gaussians that have a value that is not finite, with a note of their number.
+    """Return ``raw`` without Gaussians that have values that are not finite, with a note of their number.
 
-    An opacity logit may be infinite, and a log scale may be minus infinity: the Gaussian is flat. Raises ``UserError``
+    An opacity logit may be infinite, and a log scale may be minus infinity for a flat Gaussian. Raises ``UserError``
     for a capture without Gaussians, or if most of them are not finite.
     """
     count = len(raw.means)

@@ -1,4 +1,4 @@
-"""Paths that files name, which must not leave the folder of their data set."""
+"""Paths in untrusted files, which must not leave the folder of the data set."""
 
 from __future__ import annotations
 
@@ -13,6 +13,6 @@ def stays_inside(name: str) -> bool:
 
 
 def path_inside(path: Path, folder: Path) -> Path | None:
-    """Return ``path``, with ``..`` resolved, relative to ``folder``; None if it is not inside."""
+    """Return ``path``, with ``..`` resolved, relative to ``folder``; None if it is not inside the folder."""
     resolved, base = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
     return resolved.relative_to(base) if resolved.is_relative_to(base) else None

@@ -1,8 +1,8 @@
 """Search for the photos and masks of a data set.
 
-Tools name photos relative to different folders, with the paths of another machine, or with another suffix than that of
-the file. A name is looked up directly first; otherwise the file of the data set whose path ends in the same parts is
-used, if there is exactly one.
+Names of photos may be relative to different folders, contain paths of another machine, or have another suffix than the
+file. A name is first looked up directly. If there is no such file, the file of the data set whose path ends in the same
+parts is used, if there is exactly one.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from pathlib import Path, PurePath
 from egs_warp.io.paths import path_inside, stays_inside
 
 UNREADABLE_SUFFIXES = (".heic", ".heif")
-"""Suffixes of pictures that are found, but cannot be read."""
+"""Suffixes of pictures that are found but cannot be decoded."""
 _PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".jp2", ".avif", *UNREADABLE_SUFFIXES)
 _ADDED_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".webp")
 """Suffixes that are added to names without one."""
 _PHOTO_FOLDERS = ("images", "image", "imgs", "photos", "rgb", "color", "colour", "input", "undistorted")
 """Folders of photos, in order of preference."""
 _REDUCED = re.compile(r"(?:images|input|photos)_(\d{1,2})")
-"""Folder of photos reduced by a factor."""
+"""Pattern of names of folders with photos that are downscaled by a factor."""
 _NO_PHOTOS = re.compile(r"mask|depth|normal|segment|matte|alpha|thumb|preview", re.IGNORECASE)
-"""Names of folders whose pictures are not photos."""
+"""Pattern of names of folders whose pictures are not photos."""
 _MASK_FOLDERS = ("masks", "mask")
 """Folders of masks, in order of preference."""
 _MASK_FOLDER = re.compile(r"(?:.*[_-])?(?:masks?|mattes?|segmentations?|alphas?)(?:[_-].*)?", re.IGNORECASE)
 _MAY_BE_MASK = re.compile("mask|matte|segmentation|alpha", re.IGNORECASE)
-"""Part of the name of each mask, or of its folder."""
+"""Pattern that the name of each mask, or of its folder, contains."""
 _MASK_NAME = re.compile(r"(?:mask[._-])?(.+?)(?:[._-]mask)?")
 _MAX_DEPTH = 5
-"""Depth of the folders that are searched below the data set."""
+"""Maximum depth of the searched folders below the data set."""
 _MAX_FILES = 200_000
-"""Maximum number of files that are searched."""
+"""Maximum number of searched files."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class FoundFile:
 
     path: Path | None
     reason: str = ""
-    """Reason why there is no path, if it is not just that there is no such file."""
+    """Reason why there is no path, unless simply no such file exists."""
     by_name: bool = False
-    """True if the file is not at the path that the poses state, and was found by its name."""
+    """True if the file was not found at the path in the poses but by its name."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class PhotoAndMask:
     image: Path | None
     mask: Path | None
     missing: str
-    """Reason why the photo or, with a photo, its mask was not found, if there is a special one."""
+    """Reason why the photo, or else its mask, was not found; empty if nothing specific is known."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,12 @@ class _Candidate:
 
     path: Path
     folders: tuple[str, ...]
-    """Folders below the data set, or below the folder of masks, in lower case."""
+    """Folders of the picture below the data set, or below the folder of masks, in lower case."""
     suffix: str
     rank: int
-    """Preference of its folder; the smallest is best."""
+    """Rank of the folder of the picture; the smallest is preferred."""
     base: tuple[str, ...] = ()
-    """Folders above the folder of masks, or of a mask beside its photo."""
+    """Folders above the folder of masks, or above a mask beside its photo."""
 
 
 class PhotoFiles:
@@ -93,9 +93,9 @@ class PhotoFiles:
 
         Args:
             names: names of the photos in the file of poses.
-            folders: folders to which they are relative, in order of preference.
-            masks: names of the masks, relative to the first folder; empty for those that have no name. Masks without a
-                name are looked up by the name of their photo.
+            folders: folders to which the names are relative, in order of preference.
+            masks: names of the masks, relative to the first folder; empty texts for masks without a name, which are
+                looked up by the name of their photo.
         """
         located = []
         for number, (name, photo) in enumerate(zip(names, self.find_photos(names, folders), strict=True)):
@@ -112,9 +112,9 @@ class PhotoFiles:
         return located
 
     def find_photos(self, names: Sequence[str], folders: Sequence[Path]) -> list[FoundFile]:
-        """Find the photos ``names``, which are relative to one of ``folders`` if they are where they should be."""
+        """Find the photos ``names``, which should be relative to one of ``folders``."""
         found = [self._direct(name, folders) for name in names]
-        # A converted copy of a photo that cannot be read has the same stem.
+        # A photo that cannot be decoded may have a converted copy with the same stem.
         found = [None if path and path.suffix.lower() in UNREADABLE_SUFFIXES else path for path in found]
         if None not in found:
             return [FoundFile(path) for path in found]
@@ -128,7 +128,7 @@ class PhotoFiles:
             parents, stem, suffix = _parts(name)
             candidates = [one for one in self._photos.get(stem, ()) if one.path not in taken]
             best = _longest_matches(candidates, parents)
-            # The folder is the only distinction between photos of one name.
+            # Only the folder distinguishes photos of the same name.
             if best and parents and stems[stem] > 1 and _match(best[0], parents) == 0:
                 best = []
             best = _with_suffix(best, suffix)
@@ -144,7 +144,7 @@ class PhotoFiles:
     def find_mask(self, photo: Path, depth: int) -> FoundFile:
         """Find the mask of ``photo`` in a folder of masks, or beside it; ``depth`` is the number of parts of its name.
 
-        COLMAP appends .png to the photo's name; others keep the name, or append ``_mask``.
+        The mask has the name of the photo, the name with .png appended (COLMAP), or the name with ``_mask`` appended.
         """
         depth = max(1, min(depth, len(photo.parents) - 1))
         for folder, parts in self._mask_folders(photo.parent, depth):
@@ -164,13 +164,13 @@ class PhotoFiles:
             if one.path != photo and one.base == parents[: len(one.base)]
         ]
         best = _longest_matches(candidates, parents)
-        # Masks of other photos of the same name are in other folders.
+        # A mask in another folder may belong to another photo of the same name.
         if best and best[0].folders and _match(best[0], parents) == 0 and self._is_repeated(photo):
             best = []
         return _only(best, self._root)
 
     def find_named_mask(self, name: str, folder: Path) -> FoundFile:
-        """Find the mask ``name``, which is relative to ``folder`` if it is where it should be."""
+        """Find the mask ``name``, which should be relative to ``folder``."""
         path = self._direct(name, (folder,))
         if path is not None:
             return FoundFile(path)
@@ -182,15 +182,15 @@ class PhotoFiles:
         return found if found.path or found.reason else FoundFile(None, f"its mask {name} was not found; put it there")
 
     def _mask_folders(self, folder: Path, depth: int) -> list[tuple[Path, int]]:
-        """Return the existing folders ``masks`` for photos of ``folder``, and how many parts of the photo's path are
-        repeated there."""
+        """Return the existing folders of masks for photos of ``folder``, each with the number of parts of the photo's
+        path that are repeated in it."""
         if (folder, depth) not in self._known_mask_folders:
             places = [((folder, *folder.parents)[depth] / "masks", depth), (folder.parent / "masks", 1)]
             self._known_mask_folders[folder, depth] = [place for place in places if os.path.isdir(place[0])]
         return self._known_mask_folders[folder, depth]
 
     def _is_repeated(self, photo: Path) -> bool:
-        """Return True if photos of several folders have the name of ``photo``."""
+        """Return True if photos in several folders have the same name as ``photo``."""
         return len({one.folders for one in self._photos.get(_picture_stem(photo.name), ())}) > 1
 
     def _direct(self, name: str, folders: Sequence[Path]) -> Path | None:
@@ -198,7 +198,7 @@ class PhotoFiles:
         for text in dict.fromkeys((name, name.replace("\\", "/"))):
             stays = stays_inside(text)
             for folder in folders:
-                # Most folders do not exist, and there may be many photos.
+                # Skip missing folders quickly: most of them do not exist, and there may be many photos.
                 if stays and not self._exists(folder):
                     continue
                 path = os.path.join(folder, text)
@@ -207,7 +207,7 @@ class PhotoFiles:
                     if inside is None:
                         continue
                     path = self._root / inside
-                # os.path returns False where Path.is_file raises: for names that are too long or invalid.
+                # For names that are too long or invalid, os.path returns False, but Path.is_file raises.
                 for suffix in _ADDED_SUFFIXES:
                     if os.path.isfile(f"{path}{suffix}"):
                         return Path(f"{path}{suffix}")
@@ -226,7 +226,7 @@ class PhotoFiles:
 
     @cached_property
     def _pictures(self) -> dict[str, list[_Candidate]]:
-        """All pictures by stem."""
+        """Pictures of the data set by stem."""
         return self._by_stem(lambda _folders: True)
 
     @cached_property
@@ -261,7 +261,7 @@ class PhotoFiles:
             at = next((number for number, folder in enumerate(folders) if _MASK_FOLDER.fullmatch(folder)), None)
             if at is not None:
                 rank = _MASK_FOLDERS.index(folders[at]) if folders[at] in _MASK_FOLDERS else len(_MASK_FOLDERS)
-                # Folders above that of the masks distinguish them as well: front/masks and back/masks.
+                # Folders above the folder of masks also distinguish masks: front/masks and back/masks.
                 below = (*folders[:at], *folders[at + 1 :])
                 candidate = _Candidate(path, below, path.suffix.lower(), rank, folders[:at])
                 files[_mask_stem(path.name)].append(candidate)
@@ -281,8 +281,8 @@ def has_photos(folder: Path) -> bool:
 
 
 def photos_without_pose(images: Iterable[Path], excluded: Iterable[str] = ()) -> dict[Path, int]:
-    """Return the number of other photos in the folders of ``images``, for folders that contain any. Photos of the names
-    ``excluded`` have an invalid pose."""
+    """Return the number of photos without a pose in each folder of ``images`` that contains any. Photos with the names
+    ``excluded``, whose poses are invalid, are not counted."""
     invalid = {_parts(name)[1] for name in excluded}
     posed = defaultdict(lambda: set(invalid))
     for image in images:
@@ -319,10 +319,10 @@ def _walk(root: Path) -> Iterator[tuple[Path, tuple[str, ...]]]:
 
 
 def _parts(name: str) -> tuple[tuple[str, ...], str, str]:
-    """Return folders, stem and suffix of a name of any machine, in lower case."""
+    """Return folders, stem and suffix of a path from any operating system, in lower case."""
     parts = [part for part in re.split(r"[\\/]+", _key(name)) if part not in ("", ".")]
     while ".." in parts:
-        # The folder above is unknown where the name begins, and left again elsewhere.
+        # At the beginning of the path, ``..`` is an unknown folder; elsewhere, it cancels the folder before it.
         at = parts.index("..")
         del parts[max(at - 1, 0) : at + 1]
     if parts and re.fullmatch(r"[a-z]:|file:", parts[0]):
@@ -333,7 +333,7 @@ def _parts(name: str) -> tuple[tuple[str, ...], str, str]:
 
 
 def _key(name: str) -> str:
-    """Return ``name`` in lower case and composed letters, which systems store differently."""
+    """Return ``name`` in lower case with composed letters, because operating systems store letters differently."""
     return unicodedata.normalize("NFC", name).lower()
 
 
@@ -355,7 +355,7 @@ def _mask_stem(name: str) -> str:
 
 
 def _match(candidate: _Candidate, parents: tuple[str, ...]) -> int:
-    """Return the number of last folders that ``candidate`` shares with ``parents``."""
+    """Return the number of innermost folders that ``candidate`` and ``parents`` have in common."""
     count = 0
     for one, other in zip(reversed(candidate.folders), reversed(parents), strict=False):
         if one != other:
@@ -365,19 +365,19 @@ def _match(candidate: _Candidate, parents: tuple[str, ...]) -> int:
 
 
 def _longest_matches(candidates: Sequence[_Candidate], parents: tuple[str, ...]) -> list[_Candidate]:
-    """Return the candidates that share most folders with ``parents``."""
+    """Return the candidates that have the most innermost folders in common with ``parents``."""
     longest = max((_match(one, parents) for one in candidates), default=0)
     return [one for one in candidates if _match(one, parents) == longest]
 
 
 def _with_suffix(candidates: list[_Candidate], suffix: str) -> list[_Candidate]:
-    """Return the candidates with ``suffix``, of those that can be read, if there are any."""
+    """Return the readable candidates, if there are any, and of these the ones with ``suffix``, if there are any."""
     candidates = [one for one in candidates if one.suffix not in UNREADABLE_SUFFIXES] or candidates
     return [one for one in candidates if one.suffix == suffix] or candidates
 
 
 def _only(candidates: list[_Candidate], root: Path) -> FoundFile:
-    """Return the candidate of the best rank, if it is the only one."""
+    """Return the candidate of the best rank; no file if several have this rank."""
     if not candidates:
         return FoundFile(None)
     best = min(one.rank for one in candidates)

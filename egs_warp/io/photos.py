@@ -1,4 +1,4 @@
-"""Reading of photos and their conversion to photos of pinhole cameras, for all file formats and lenses."""
+"""Reading of photos and their undistortion to photos of pinhole cameras, for all file formats and lenses."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from egs_warp.io.posed_images import PosedImage
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _CHUNK = 12
-"""Bytes of a PNG chunk in addition to its content."""
+"""Number of bytes of a PNG chunk in addition to its content."""
 _MAX_SIDE_RATIO = 16
 """Maximum ratio of the side of a photo to the side of its camera's image."""
 MAX_MASK_RATIO = _MAX_SIDE_RATIO**2
-"""Maximum ratio of the number of pixels of a mask to that of its camera's image."""
+"""Maximum ratio of the number of pixels of a mask to the number of pixels of its camera's image."""
 _SAME_ASPECT = 0.01
-"""Relative difference between the aspect ratios of a photo and its camera up to which the photo is a scaled one of that
+"""Maximum relative difference between the aspect ratios of a photo and its camera if the photo is a scaled image of the
 camera."""
 
 
@@ -34,30 +34,31 @@ class Photo:
     """A photo, undistorted and with the orientation of its camera."""
 
     camera: Camera
-    """The camera at the photo's size."""
+    """The camera, scaled to the size of the photo."""
     colour: np.ndarray
     """(H, W, 3) float32, 0 to 1, display-referred."""
     alpha: np.ndarray | None
-    """(H, W) float32, the photo's own, or that of its mask; None without either."""
+    """(H, W) float32, alpha of the photo, of its mask, or the minimum of both; None without either."""
     known: np.ndarray | None
     """(H, W) bool, False for pixels of the undistorted photo outside the view of the lens; None if there are none."""
     is_opaque: bool = False
-    """True if the photo has an alpha channel that is opaque everywhere, which is not in ``alpha``: most programs write
-    such a channel into photos without a cut-out."""
+    """True if the photo has an alpha channel that is opaque everywhere. It is ignored in ``alpha``, because many
+    programs write such a channel into ordinary photos."""
 
 
 def read_photo(posed: PosedImage, *, max_side: int | None = None, is_mask_inverted: bool = False) -> Photo:
-    """Read the photo of ``posed``; one larger than ``max_side`` pixels is reduced.
+    """Read the photo of ``posed``, downscaled to at most ``max_side`` pixels.
 
-    The EXIF orientation is applied only if the pixels would not fit the camera otherwise. Alpha is the minimum of the
-    photo's own alpha, unless that is opaque everywhere, and of its mask, in which white is opaque, or black with
-    ``is_mask_inverted``. Raises ``UserError`` for a photo that is missing, unreadable or does not fit its camera.
+    The EXIF orientation is applied only if the pixels would not fit the camera otherwise. The alpha is the minimum of
+    the photo's own alpha, unless it is opaque everywhere, and of the mask. White is opaque in a mask; with
+    ``is_mask_inverted``, black is. Raises ``UserError`` for a photo that is missing, unreadable or does not fit its
+    camera.
     """
     if posed.image is None:
         raise UserError(f"{posed.name}: {posed.missing or 'the photo is not beside the poses; put it there'}")
     size = picture_size(posed.image, f"{posed.image}: it")
     if size is not None:
-        # Before decoding: a small file may contain a very large picture.
+        # Check the size before decoding, because a small file may contain a very large picture.
         limit = _MAX_SIDE_RATIO**2 * posed.camera.width * posed.camera.height
         check_pixels(*size, f"{posed.image}: it", at_most=min(limit, MAX_PIXELS))
         _orientation_to_fit(posed, size[::-1])
@@ -89,7 +90,7 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None, is_mask_invert
         camera = at_size(camera, width, height)
         cover = None if alpha is None and known is None else np.ones(colour.shape[:2], np.float32)
         if cover is not None:
-            # Transparent and unknown pixels may have any colour, which must not bleed into their neighbours.
+            # Weight by coverage: transparent and unknown pixels may have any colour, which must not bleed into others.
             cover = cover * (1.0 if alpha is None else alpha) * (1.0 if known is None else known)
             reduced = cv2.resize(cover, (width, height), interpolation=cv2.INTER_AREA)
             colour = cv2.resize(colour * cover[:, :, None], (width, height), interpolation=cv2.INTER_AREA)
@@ -104,8 +105,8 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None, is_mask_invert
 
 
 def at_size(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera for its photo at another size: often the poses belong to the full photos, but the image files
-    are reduced."""
+    """Return the camera for its photo at another size. Often the poses belong to the original photos, but the image
+    files are downscaled."""
     x, y = width / camera.width, height / camera.height
     return replace(
         camera,
@@ -119,7 +120,8 @@ def at_size(camera: Camera, width: int, height: int) -> Camera:
 
 
 def decoded(image: Path) -> np.ndarray:
-    """(H, W) or (H, W, C) as stored, BGR, without rotation. Raises ``UserError`` if the picture is damaged."""
+    """Return the pixels (H, W) or (H, W, C) of a picture as stored: BGR, not rotated. Raises ``UserError`` if it is
+    damaged."""
     from PIL import Image
 
     if image.suffix.lower() in UNREADABLE_SUFFIXES:
@@ -132,7 +134,7 @@ def decoded(image: Path) -> np.ndarray:
         raise UserError(f"{image}: not a readable picture; export it again as PNG or JPEG")
     if image.suffix.lower() in (".jpg", ".jpeg"):
         try:
-            # OpenCV fills the rest of a truncated JPEG with grey.
+            # Pillow reports a truncated JPEG, whose missing pixels OpenCV fills with grey.
             with Image.open(image) as opened:
                 opened.load()
         except Exception as error:
@@ -141,9 +143,9 @@ def decoded(image: Path) -> np.ndarray:
 
 
 def _pixels(image: Path, flags: int) -> np.ndarray | None:
-    """Decode a file by OpenCV; None if it cannot.
+    """Decode a file with OpenCV; return None if OpenCV cannot decode it.
 
-    OpenCV allocates the size that a PNG chunk declares, so this size is checked first.
+    OpenCV allocates the size that a PNG chunk declares, so the sizes of chunks are checked first.
     """
     with open(image, "rb") as file:
         left = os.fstat(file.fileno()).st_size - len(_PNG)
@@ -185,8 +187,13 @@ def _is_scaled(size: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def _oriented_mask(path: Path, shape: tuple[int, ...], turn: int) -> np.ndarray:
-    """(H, W) float32 from the mask file of a photo of ``shape`` (height, width) as stored, which was rotated by
-    ``turn``. A mask of another size is scaled."""
+    """Return the mask (H, W) float32 of a photo.
+
+    Args:
+        path: file of the mask. A mask of another size is scaled.
+        shape: height and width of the photo as stored.
+        turn: EXIF orientation that was applied to the photo.
+    """
     height, width = shape
     size = picture_size(path, f"{path}: it")
     if size is None:
@@ -202,13 +209,16 @@ def _oriented_mask(path: Path, shape: tuple[int, ...], turn: int) -> np.ndarray:
     if mask.shape != target[::-1]:
         is_larger = mask.size > width * height
         mask = cv2.resize(mask, target, interpolation=cv2.INTER_AREA if is_larger else cv2.INTER_LINEAR)
-    # A mask of the photo as stored is rotated with it.
+    # Rotate the mask with the photo if it was drawn on the photo as stored.
     return apply_orientation(mask, turn) if is_stored else mask
 
 
 def read_mask_file(path: Path, *, at_most: int = MAX_PIXELS) -> np.ndarray:
-    """(H, W) float32 from 0 to 1, the grey of a mask as stored, or its alpha channel if that is not opaque everywhere.
-    Raises ``UserError`` if it is not a readable picture, or has more than ``at_most`` pixels."""
+    """Return a mask (H, W) float32 from 0 to 1 as stored: its alpha channel if that is not opaque everywhere, otherwise
+    its grey values.
+
+    Raises ``UserError`` if the file is not a readable picture, or has more than ``at_most`` pixels.
+    """
     from PIL import Image
 
     size = picture_size(path, f"{path}: it")
@@ -219,12 +229,12 @@ def read_mask_file(path: Path, *, at_most: int = MAX_PIXELS) -> np.ndarray:
         with Image.open(path) as opened:
             if "A" in opened.getbands() or "transparency" in opened.info:
                 pixels = np.asarray(opened.convert("RGBA"))[:, :, 3]
-    # The decoder reads untrusted bytes, and its errors share no base class.
+    # The decoder reads untrusted bytes, and its errors have no common base class.
     except Exception as error:
         raise UserError(f"{path}: not a readable picture; export the mask again") from error
     if pixels is None or pixels.min() == pixels.max():
         pixels = _pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise UserError(f"{path}: not a readable picture; export the mask again")
-    # Masks of labels contain 0 and 1.
+    # Label masks contain only 0 and 1.
     return pixels.astype(np.float32) / (1.0 if pixels.max() == 1 else 255.0)

@@ -23,7 +23,7 @@ from egs_warp.io.planes import PlaneRecord
 from egs_warp.io.text import decode_text, parse_json
 
 VERSION = 1
-"""Version of the file."""
+"""Version of the file format."""
 MAX_NAME_LENGTH = 60
 """Maximum number of characters of an object's name."""
 _REMEDY = "pick the object again with egs-warp pick"
@@ -37,7 +37,7 @@ class PickedObject:
     gaussians: np.ndarray
     """(n,) bool, True for the object's Gaussians."""
     plane: PlaneRecord
-    """Ground on which the object stands."""
+    """Ground plane on which the object stands."""
     front: np.ndarray | None = None
     """(3,) direction in which the object faces; None to estimate it."""
 
@@ -66,7 +66,7 @@ class PickedFile:
 
 
 def write_picked(path: Path | str, picked: PickedFile, cloud: GaussianCloud) -> None:
-    """Write the objects of ``cloud``."""
+    """Write the picked objects of ``cloud``."""
     tree = {
         "version": VERSION,
         "capture": {"name": picked.capture, "gaussians": cloud.count, "sha256": _digest(cloud)},
@@ -78,7 +78,7 @@ def write_picked(path: Path | str, picked: PickedFile, cloud: GaussianCloud) -> 
 
 
 def read_picked(path: Path | str, cloud: GaussianCloud) -> PickedFile:
-    """Read the objects of ``cloud``.
+    """Read the picked objects of ``cloud``.
 
     Raises ``UserError`` if the file is missing or damaged, and if it belongs to another capture.
     """
@@ -128,7 +128,7 @@ def _from_json(entry: Any, path: Path, number: int, count: int) -> PickedObject:
         raise UserError(f"{path}: object {number} needs a name of 1 to {MAX_NAME_LENGTH} characters; correct it")
     size = -(-count // 8)
     try:
-        # The size of the result is limited: a few bytes can expand beyond the memory of any machine.
+        # Limit the size of the result, because a few bytes can expand beyond the available memory.
         unpacker = zlib.decompressobj()
         packed = unpacker.decompress(base64.b64decode(entry["gaussians"], validate=True), size + 1)
     except (TypeError, ValueError, binascii.Error, zlib.error) as error:
@@ -149,5 +149,5 @@ def _from_json(entry: Any, path: Path, number: int, count: int) -> PickedObject:
 
 
 def _digest(cloud: GaussianCloud) -> str:
-    """Return the SHA-256 of the Gaussians' positions."""
+    """Return the SHA-256 of the positions of the Gaussians."""
     return hashlib.sha256(np.ascontiguousarray(cloud.means.numpy()).tobytes()).hexdigest()

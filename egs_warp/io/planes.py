@@ -1,4 +1,4 @@
-"""Planes on disk: ``plane.json``, which every stage from a scene to an animation reads."""
+"""Planes on disk: ``plane.json``, which all stages from a scene to an animation read."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MAX_TEXELS = 1 << 13
 
 @dataclass(frozen=True)
 class HoleOutline:
-    """A hole in a plane: its outlines, in columns and rows of a window on the plane."""
+    """A hole in a plane, described by outlines in a window on the plane."""
 
     centre: np.ndarray
     """(3,) centre of the window, scene units."""
@@ -33,7 +33,7 @@ class HoleOutline:
     texels: tuple[int, int]
     """Rows and columns of the window."""
     outlines: tuple[np.ndarray, ...]
-    """(k, 2) int32 each, polygons around the hole; column and row in texels."""
+    """Polygons (k, 2) int32 around the hole; columns and rows in texels."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry ``hole`` of a plane."""
@@ -67,27 +67,27 @@ class PlaneRecord:
 
     plane: Plane
     centre: np.ndarray | None = None
-    """(3,) centre of the object that stands on it."""
+    """(3,) centre of the object on the plane."""
     size: float | None = None
-    """Diagonal of that object's bounding box."""
+    """Diagonal of the object's bounding box."""
     noise: float | None = None
-    """Relative noise of the depth that the plane was fitted to."""
+    """Relative noise of the depth to which the plane was fitted."""
     inlier_share: float | None = None
     pixels: int | None = None
-    """Number of pixels that it was fitted to."""
+    """Number of pixels to which the plane was fitted."""
     support: float | None = None
-    """Share of the visible surface that lies on it."""
+    """Share of the visible surface that lies on the plane."""
     hole: HoleOutline | None = None
     """Hole that the removed object leaves in the plane; None if there is none."""
     ground: HeightField | None = None
     """Height field of the ground if it is uneven; None if the plane is the ground."""
     others: Mapping[str, Any] = field(default_factory=dict)
-    """Further entries of the file, which are passed on unchanged."""
+    """Other entries of the file, which are preserved."""
     light: MainLight | None = None
-    """Main light of the capture; None if it is not clear."""
+    """Main light of the capture; None if its estimate is uncertain."""
 
     def merged_with(self, known: PlaneRecord) -> PlaneRecord:
-        """Return this plane; its unknown properties are taken from ``known``."""
+        """Return this plane, with missing properties taken from ``known``."""
         facts = {name: value for name in _FACTS if (value := getattr(self, name)) is not None}
         earlier = {name: getattr(known, name) for name in _FACTS}
         return PlaneRecord(self.plane, **(earlier | facts), others={**known.others, **self.others})
@@ -139,7 +139,7 @@ class PlaneRecord:
 
 
 def _ground_to_json(ground: HeightField) -> dict[str, Any]:
-    # A thousandth of a node's spacing is far below the accuracy of depth.
+    # Round to a thousandth of the node spacing, which is far below the accuracy of depth.
     digits = max(0, 3 - int(np.floor(np.log10(ground.spacing))))
     return {
         "axes": ground.axes.tolist(),
@@ -193,7 +193,7 @@ _FACTS = tuple(one.name for one in fields(PlaneRecord) if one.name not in ("plan
 
 
 def write_planes(path: Path | str, planes: Sequence[PlaneRecord]) -> None:
-    """Write ``planes`` (capture's units); the object rests on the first one."""
+    """Write ``planes``, in units of the capture; the object rests on the first one."""
     entries = [known.to_json() for known in planes]
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps({"planes": entries}, indent=1))

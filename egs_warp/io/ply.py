@@ -37,12 +37,12 @@ _TYPES = {
     **dict.fromkeys(("float", "float32", "f4"), "f4"),
     **dict.fromkeys(("double", "float64", "f8"), "f8"),
 }
-"""Types of properties: the names of G. Turk, names with the number of bits, those of NumPy, and half floats, which
-Babylon.js writes."""
+"""Types of properties by name: the original names of G. Turk, names with the number of bits, NumPy's names, and half
+floats, which Babylon.js writes."""
 _BYTE_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": None}
 _SHOWN = 5
 """Maximum number of names in a note."""
-# A block of this many rows stays in the cache while its columns are gathered one by one.
+# Number of rows of a block, which fits into the cache while its columns are gathered one by one.
 _BLOCK_ROWS = 16384
 _FEW_COLUMNS = 8
 
@@ -68,7 +68,7 @@ class PlyHeader:
     size: int
     """Size of the header in bytes."""
     comments: tuple[str, ...] = ()
-    """Text of its ``comment`` and ``obj_info`` lines."""
+    """Texts of the ``comment`` and ``obj_info`` lines."""
 
     def element(self, name: str) -> PlyElement | None:
         """Return the element called ``name``, or None."""
@@ -76,7 +76,7 @@ class PlyHeader:
 
 
 def read_header(data: bytes, source: Path) -> PlyHeader:
-    """Parse a .ply header. Raises ``UserError`` for one that is truncated or malformed."""
+    """Parse a .ply header. Raises ``UserError`` if it is truncated or malformed."""
     end = re.search(rb"^end_header[ \t]*\r?\n", data, re.MULTILINE)
     if end is None:
         raise UserError(f"{source}: truncated: the .ply header has no end_header line; copy or export the file again")
@@ -122,7 +122,7 @@ def _element(
 
 
 def read_elements(data: bytes, header: PlyHeader, names: list[str], source: Path) -> dict[str, np.ndarray]:
-    """Return structured arrays of the ``names`` elements. Raises ``UserError`` for data that are truncated or not
+    """Return structured arrays of the elements ``names``. Raises ``UserError`` for data that are truncated or not
     numeric."""
     if header.byte_order is None:
         return _read_text(data, header, names, source)
@@ -146,7 +146,7 @@ def read_elements(data: bytes, header: PlyHeader, names: list[str], source: Path
 
 
 def _read_text(data: bytes, header: PlyHeader, names: list[str], source: Path) -> dict[str, np.ndarray]:
-    # One line at a time: a list of all would take far more memory than the file.
+    # Read one line at a time, because a list of all lines would take far more memory than the file.
     lines = re.finditer(rb"[^\r\n]*[^\s][^\r\n]*", memoryview(data)[header.size :])
     arrays: dict[str, np.ndarray] = {}
     end = 0
@@ -154,7 +154,7 @@ def _read_text(data: bytes, header: PlyHeader, names: list[str], source: Path) -
         if not set(names) - set(arrays):
             break
         if element.dtype is not None and not element.dtype.names:
-            # Rows without a number are empty lines.
+            # The rows of an element without properties are empty lines.
             continue
         count, start = 0, end
         for line in islice(lines, element.count):
@@ -168,7 +168,7 @@ def _read_text(data: bytes, header: PlyHeader, names: list[str], source: Path) -
             )
         columns = len(element.dtype.names or ())
         with warnings.catch_warnings():
-            # numpy only warns about text that is not a number; newer versions raise ValueError.
+            # Old versions of NumPy only warn about text that is not a number; newer ones raise ValueError.
             warnings.simplefilter("error", DeprecationWarning)
             try:
                 text: Any = bytes(memoryview(data)[header.size + start : header.size + end])
@@ -184,13 +184,13 @@ def _read_text(data: bytes, header: PlyHeader, names: list[str], source: Path) -
 
 
 def columns_as_float32(rows: np.ndarray, names: list[str]) -> np.ndarray:
-    """(n, len(names)) float32 from the named fields of a structured array."""
+    """Return the fields ``names`` of the structured array ``rows`` as (n, len(names)) float32."""
     out = np.empty((len(rows), len(names)), np.float32)
     layout: Any = rows.dtype.fields or {}
     fields = [layout[name] for name in names]
     aligned = rows.dtype.itemsize % 4 == 0 and all(kind == "<f4" and place % 4 == 0 for kind, place, *_ in fields)
     if aligned and len(names) > _FEW_COLUMNS:
-        # One pass over the rows takes a quarter of the time of one for each column.
+        # A single pass over the rows takes a quarter of the time of a pass for each column.
         words = rows.view("<f4").reshape(len(rows), rows.dtype.itemsize // 4)
         columns = [place // 4 for _, place, *_ in fields]
         for start in range(0, len(rows), _BLOCK_ROWS):
@@ -212,9 +212,9 @@ def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
     """Decode the INRIA layout: the Gaussians are the rows of element ``vertex``, with properties in any order and of
     any numeric type.
 
-    Without ``scale_2`` they are flat, like those of 2D Gaussian Splatting. Colours may be red, green and blue instead
-    of SH coefficients, and alpha instead of the opacity's logit. Raises ``UserError`` if the file does not contain
-    Gaussians in this layout.
+    Without ``scale_2``, the Gaussians are flat, as in 2D Gaussian Splatting. Instead of SH coefficients, colours may be
+    red, green and blue; instead of the logit of the opacity, there may be alpha. Raises ``UserError`` if the file does
+    not contain Gaussians in this layout.
     """
     vertex = header.element("vertex")
     kinds = vertex.dtype if vertex is not None and vertex.dtype is not None else np.dtype([])
@@ -283,7 +283,8 @@ def _rest_count(present: Sequence[str], source: Path) -> int:
 
 
 def _fractions(values: np.ndarray, kind: np.dtype) -> np.ndarray:
-    """Return colours or opacities as 0 ... 1; integers cover the range of their type, floats 0 ... 1 or 0 ... 255."""
+    """Return colours or opacities, scaled to 0 ... 1. Integers cover the range of their type, floats 0 ... 1 or
+    0 ... 255."""
     if kind.kind == "u":
         return values / np.float32(np.iinfo(kind).max)
     return values / np.float32(255.0) if np.nanmax(values, initial=0.0) > 1.0 else values
@@ -319,8 +320,7 @@ def _rounding_notes(rows: np.ndarray, names: list[str]) -> list[str]:
 
 
 def _omission_notes(header: PlyHeader, properties: set[str]) -> list[str]:
-    """Return notes of the elements other than ``vertex``, and of ``properties`` of the Gaussians, which are all left
-    out."""
+    """Return notes of what is left out: elements other than ``vertex``, and ``properties`` of the Gaussians."""
     notes = [f"properties left out: {_listed(sorted(properties))}"] if properties else []
     elements = [element.name for element in header.elements if element.name != "vertex" and element.count]
     return [*notes, *([f"elements left out: {_listed(elements)}"] if elements else [])]
@@ -335,8 +335,8 @@ def _columns_as_float64(rows: np.ndarray, names: list[str]) -> np.ndarray:
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read positions (n, 3) float64 and colours (n, 3) float64, 0 to 1, of a .ply of coloured points; grey without
-    colours.
+    """Read positions (n, 3) float64 and colours (n, 3) float64, 0 to 1, of a .ply of points; points without colours are
+    grey.
 
     Raises ``UserError`` if it is malformed or has no positions.
     """
@@ -362,7 +362,7 @@ def write_ply(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | No
     Args:
         path: The file.
         cloud: The Gaussians.
-        origin: (3,) Offset that is added to the positions (``Capture.origin``), which then are doubles.
+        origin: (3,) Offset that is added to the positions (``Capture.origin``), which are then written as doubles.
     """
     rest_count = 3 * ((cloud.sh_degree + 1) ** 2 - 1)
     names = [
@@ -395,11 +395,11 @@ def write_ply(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | No
 
 
 def channel_major(sh: np.ndarray) -> np.ndarray:
-    """(n, 3 (K-1)) ``f_rest`` of (n, K, 3) coefficients: all of red, then green, then blue."""
+    """Return ``f_rest`` (n, 3 (K-1)) of the coefficients ``sh`` (n, K, 3): all of red, then green, then blue."""
     return np.ascontiguousarray(sh[:, 1:].transpose(0, 2, 1)).reshape(len(sh), -1)
 
 
 def coefficient_major(f_dc: np.ndarray, f_rest: np.ndarray) -> np.ndarray:
-    """Inverse of ``channel_major``: (n, K, 3) from (n, 3) and (n, 3 (K-1))."""
+    """Return coefficients (n, K, 3) from ``f_dc`` (n, 3) and ``f_rest`` (n, 3 (K-1)); inverse of ``channel_major``."""
     rest = f_rest.reshape(len(f_rest), 3, -1).transpose(0, 2, 1)
     return np.concatenate([f_dc[:, None], rest], axis=1)

@@ -1,7 +1,8 @@
 """Tags in the comments of a .ply header: training with antialiasing, and the vertical axis.
 
-Forms in use: ``SplatRenderMode: mip`` (Brush, gsplat, splat-transform), ``antialiased 1`` (Postshot), ``Vertical Axis:
-z`` (nerfstudio) and ``Vertical axis: 0 -1 0`` (Brush), in any letter case. If there are several, the last one applies.
+Tags in use are ``SplatRenderMode: mip`` (Brush, gsplat, splat-transform), ``antialiased 1`` (Postshot),
+``Vertical Axis: z`` (nerfstudio) and ``Vertical axis: 0 -1 0`` (Brush), in any letter case. The last of several tags
+applies.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ def antialiased_of(comments: Sequence[str]) -> bool:
 
 
 def up_of(comments: Sequence[str]) -> tuple[np.ndarray | None, int | None]:
-    """Return the up direction (3,), unit, that ``comments`` state, or None; and the vertical axis if its sign is not
-    reliable, or None.
+    """Return the up direction in ``comments``, a unit vector (3,) or None, and the index of the vertical axis if its
+    sign is not reliable, otherwise None.
 
-    Brush writes ``Vertical axis: y`` into every file without an axis of its own, even if -y is up.
+    Brush writes ``Vertical axis: y`` into every file whose axis is unknown, even if -y is up.
     """
     up, axis = None, None
     for comment in comments:

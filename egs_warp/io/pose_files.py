@@ -13,15 +13,15 @@ from egs_warp.io.photo_files import has_photos
 
 _JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
 _MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap")
-"""Folders of COLMAP models or of their numbered folders, in order of preference."""
+"""Folders that contain COLMAP models or their numbered folders, in order of preference."""
 _DISTORTED = "distorted/sparse"
 """Folder of the COLMAP model of the original photos, before their undistortion."""
 _BETWEEN = ("sparse", "colmap", "distorted")
-"""Names of folders between the model and the folder of the data set."""
+"""Names of folders that may lie between the model and the folder of the data set."""
 _MAX_DEPTH = 3
-"""Depth to which other folders are searched."""
+"""Maximum depth to which other folders are searched."""
 _START_BYTES = 4096
-"""Number of bytes at the beginning by which .csv and .xml files are recognised."""
+"""Number of bytes at the beginning of .csv and .xml files by which their format is recognised."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class PoseSource:
     root: Path
     """Folder of the data set, which contains photos and masks."""
     notes: tuple[str, ...] = ()
-    """Messages for the user about the choice."""
+    """Messages for the user about the choice among several files."""
 
 
 def find_poses(source: Path) -> PoseSource:
-    """Find the camera poses in the file or folder ``source``. Of several COLMAP models of one kind, the one with the
-    most photos is used.
+    """Find the camera poses in the file or folder ``source``. If there are several COLMAP models of one kind, the one
+    with the most photos is used.
 
     Raises ``UserError`` if there are none.
     """
@@ -70,8 +70,8 @@ def _has_model(folder: Path) -> bool:
 
 
 def _model_folders(source: Path) -> list[Path]:
-    """Return the folders of COLMAP models, in order of preference; those before the undistortion only if there are no
-    others."""
+    """Return the folders of COLMAP models, in order of preference. Models of the photos before the undistortion are
+    returned only if there are no others."""
     places = [source, *_numbered(source)]
     for name in _MODEL_FOLDERS:
         # Numbered folders come before a model that was placed above them later.
@@ -95,7 +95,7 @@ def _content(folder: Path) -> list[Path]:
 
 
 def _folders(source: Path) -> Iterator[Path]:
-    """Iterate over the folders below ``source`` in a fixed order, without hidden ones."""
+    """Iterate over the folders below ``source`` in a fixed order, without hidden folders."""
     for folder, folders, _names in os.walk(source):
         depth = len(Path(folder).relative_to(source).parts)
         folders[:] = sorted(one for one in folders if not one.startswith(".")) if depth < _MAX_DEPTH else []
@@ -127,13 +127,13 @@ def _largest(models: list[Path], source: Path) -> tuple[Path, str]:
 
 
 def _data_folder(model: Path, source: Path) -> Path:
-    """Return the folder of the data set of a COLMAP model: the folder above those that contain only models."""
+    """Return the folder of the data set of a COLMAP model, above the folders that contain only models."""
     folder = model.absolute()
     if folder.name.isdecimal() and folder.parent.name in _BETWEEN:
         folder = folder.parent
     while folder.name in _BETWEEN:
         folder = folder.parent
-    # Use the user's folder if it is the same folder or one above it, or if it contains photos itself.
+    # Use the folder that the user has named if it equals or contains the found one, or if it contains photos itself.
     if folder.is_relative_to(source.absolute()) or has_photos(source):
         return source
     return folder
@@ -145,7 +145,7 @@ def _exports(folder: Path) -> Iterator[Path]:
         if path.suffix.lower() in (".csv", ".xml") and path.is_file():
             try:
                 with open(path, "rb") as file:
-                    # UTF-16 has a zero after each of these letters.
+                    # In UTF-16, each of these letters comes with a zero byte.
                     start = file.read(_START_BYTES).replace(b"\0", b"").lower()
             except OSError:
                 continue

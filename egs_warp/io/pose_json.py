@@ -33,11 +33,11 @@ LENSES = (
 )
 """Values of ``camera_model`` in transforms.json."""
 _TOKEN = re.compile(r'"(?:\\.|[^"\\])*"|[-+]?\b(?:nan(?:\(\w*\))?|inf(?:inity)?)(?![\w(])', re.IGNORECASE)
-"""A string, or a number that is not finite as C and C++ write it."""
+"""Pattern of a string, or of a number that is not finite in the notation of C and C++."""
 
 
 def parse_pose_json(source: Path) -> Any:
-    """Parse a .json of poses. Raises ``UserError`` if it is not JSON."""
+    """Parse a JSON file of poses. Raises ``UserError`` if it is not JSON."""
     text = decode_text(read_bytes(source, at_most=MAX_TEXT_BYTES), source)
     try:
         return json.loads(text, parse_int=whole_number)
@@ -54,7 +54,7 @@ def parse_pose_json(source: Path) -> Any:
 
 
 def read_pose_json(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], list[ExcludedPhoto]]:
-    """Read the cameras of a .json and find their photos and masks in ``files``. Invalid cameras are excluded.
+    """Read the cameras of a JSON file, and find their photos and masks in ``files``. Invalid cameras are excluded.
 
     Raises ``UserError`` for a file that is malformed, or has no valid camera.
     """
@@ -93,7 +93,7 @@ def _entries(source: Path, kind: str, entries: Sequence[object], places: Sequenc
 
 
 def _names(entries: list, key: str, default: str | None = None) -> list[str]:
-    """Return a name of each entry; ``default``, or its number, for entries without one."""
+    """Return the name of each entry; for entries without a name, ``default`` or the number of the entry."""
     named = [entry.get(key) if isinstance(entry, dict) else None for entry in entries]
     return [
         name if isinstance(name, str) else (f"number {number}" if default is None else default)
@@ -102,7 +102,8 @@ def _names(entries: list, key: str, default: str | None = None) -> list[str]:
 
 
 def _inria(entry: _Entry) -> PosedImage:
-    """Convert a camera: ``position`` and ``rotation`` are camera to world, in OpenCV axes."""
+    """Convert a camera of INRIA's format: ``position`` and ``rotation`` map the camera, in OpenCV axes, to the
+    world."""
     record = _Record(entry.source, entry.where, entry.fields)
     name = record.text("img_name")
     width, height = record.size("width"), record.size("height")
@@ -122,8 +123,14 @@ def _inria(entry: _Entry) -> PosedImage:
 
 
 def _transform(entry: _Entry, shared: dict, size: tuple[int, int] | None) -> PosedImage:
-    """Convert a frame: ``transform_matrix`` is camera to world, y up and z backwards; intrinsics are in the frame or
-    shared. ``size`` is that of the photo as stored, for a file without sizes."""
+    """Convert a frame of transforms.json: ``transform_matrix`` maps the camera, with y up and z backwards, to the
+    world.
+
+    Args:
+        entry: the frame.
+        shared: intrinsics that apply to frames without their own.
+        size: size of the photo as stored, for a file without sizes.
+    """
     if not isinstance(entry.fields, dict):
         raise UserError(f"{entry.source}: {entry.where} is not a JSON object; export the poses again")
     record = _Record(entry.source, entry.where, {**shared, **entry.fields})
@@ -175,8 +182,7 @@ def _lens(record: _Record) -> Lens | None:
 
 
 def _oriented_size(record: _Record, image: Path | None, size: tuple[int, int] | None) -> tuple[int, int]:
-    """Return the size of the photo: as stored, or as rotated by its EXIF orientation if the principal point fits only
-    then.
+    """Return the size of the photo: as stored, or after its EXIF orientation if the principal point fits only then.
 
     Raises the error of the photo if its ``size`` is unknown.
     """
@@ -189,8 +195,8 @@ def _oriented_size(record: _Record, image: Path | None, size: tuple[int, int] | 
 
 
 def _sizes(tree: dict, places: Sequence[PhotoAndMask], source: Path) -> list[tuple[int, int] | None]:
-    """Return the size of each photo as stored, for a file without sizes. If all readable photos have the same size, the
-    others get that size, too."""
+    """Return the size of each photo as stored, for a file without sizes. If all readable photos have the same size, it
+    is assumed for the others, too."""
     frames = [frame for frame in tree["frames"] if isinstance(frame, dict)]
     if all(key in tree or key in frame for frame in frames for key in ("w", "h")):
         return [None] * len(places)
@@ -233,28 +239,28 @@ class _Record:
         return values[:3]
 
     def _array(self, key: str) -> np.ndarray:
-        """Return the numbers of a field; NaN if it has other values."""
+        """Return the numbers of a field; NaN if it does not contain numbers."""
         try:
             return np.array(_with_decimal_points(self.fields.get(key)), dtype=np.float64)
         except (TypeError, ValueError, OverflowError, RecursionError):
             return np.array(np.nan)
 
     def focal(self, key: str) -> float:
-        """Return a length in pixels."""
+        """Return a focal length in pixels."""
         value = float(self.numbers(key, ()))
         if value <= 0:
             raise self._wrong(key, "a positive number")
         return value
 
     def angle(self, key: str) -> float:
-        """Return a field of view in rad."""
+        """Return a field of view, rad."""
         value = float(self.numbers(key, ()))
         if not 0 < value < np.pi:
             raise self._wrong(key, "an angle between 0 and pi")
         return value
 
     def size(self, key: str) -> int:
-        """Return a number of pixels."""
+        """Return a width or height in pixels."""
         value = float(self.numbers(key, ()))
         if value < 1 or value != int(value):
             raise self._wrong(key, "a number of pixels")
@@ -283,15 +289,15 @@ class _Record:
 
 
 def _with_decimal_points(value: object) -> object:
-    """Return ``value`` with numbers in place of texts such as "0,5"."""
+    """Return ``value`` with texts such as "0,5" replaced by numbers."""
     if isinstance(value, list):
         return [_with_decimal_points(one) for one in value]
     return decimal_number(value) if isinstance(value, str) else value
 
 
 def write_cameras(path: Path | str, cameras: Sequence[Camera], names: Sequence[str]) -> None:
-    """Write INRIA ``cameras.json``, which ``read_cameras`` and most tools read. Principal points must be in the middle
-    of the image."""
+    """Write INRIA's ``cameras.json``, which ``read_cameras`` and most tools read. Principal points must be in the
+    middle of the images."""
     entries = [
         {
             "id": number,

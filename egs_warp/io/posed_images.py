@@ -17,9 +17,9 @@ from egs_warp.io.limits import MAX_COORDINATE, check_pixels, picture_size
 _MAX_FOCAL = 1e3
 """Maximum ratio of the focal length to the longer side of the photo; the minimum is its reciprocal."""
 _MAX_CENTRE = 10.0
-"""Maximum absolute coordinate of the principal point, relative to the longer side of the photo."""
+"""Maximum magnitude of a coordinate of the principal point, relative to the longer side of the photo."""
 _MAX_OFFSET = 1e3
-"""Distance of the cameras from the origin, in radii of the camera path, up to which single precision is sufficient."""
+"""Maximum distance of the cameras from the origin, in radii of the camera path, for which single precision suffices."""
 
 _Entry = TypeVar("_Entry")
 _Result = TypeVar("_Result")
@@ -32,9 +32,10 @@ class PosedImage:
     name: str
     camera: Camera
     image: Path | None
-    """The photo's file; None if it was not found."""
+    """File of the photo; None if it was not found."""
     lens: Lens | None = None
-    """Distortion of the photo; ``camera`` is then that of the undistorted photo, of the same size."""
+    """Distortion of the photo; ``camera`` is the camera of the undistorted photo of the same size. None for a pinhole
+    camera."""
     mask: Path | None = None
     """File of the photo's mask; None if there is none."""
     missing: str = ""
@@ -47,7 +48,7 @@ class ExcludedPhoto:
 
     name: str
     reason: str
-    """Reason, for the user."""
+    """Reason of the exclusion, for the user."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class PosedImages:
     source: Path
     """The file, or the folder of the COLMAP model."""
     images: tuple[PosedImage, ...]
-    """Photos with valid poses, at least one."""
+    """Photos with valid poses; at least one."""
     excluded: tuple[ExcludedPhoto, ...] = ()
     """Photos whose pose or camera is invalid."""
     notes: tuple[str, ...] = ()
@@ -81,7 +82,7 @@ class PosedImages:
 def convert_each(
     entries: Iterable[tuple[str, _Entry]], convert: Callable[[_Entry], _Result], what: str
 ) -> tuple[list[_Result], list[ExcludedPhoto]]:
-    """Convert named entries; those that raise ``UserError`` are excluded.
+    """Convert named entries; entries that raise ``UserError`` are excluded.
 
     Raises the first of these errors if no entry can be converted, and ``UserError`` with the message ``what`` if there
     are no entries.
@@ -115,7 +116,7 @@ def checked_camera(camera: Camera, what: str) -> Camera:
 
 
 def is_rotation(matrix: np.ndarray) -> bool:
-    """Return True if ``matrix`` (3, 3) is a rotation, to three digits."""
+    """Return True if ``matrix`` (3, 3) is a rotation to an accuracy of three digits."""
     return bool(np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) and np.linalg.det(matrix) > 0)
 
 
@@ -129,7 +130,8 @@ def size_of_photo(image: Path | None, what: str) -> tuple[int, int]:
 
 
 def near_origin(poses: PosedImages) -> PosedImages:
-    """Subtract the offset of georeferenced cameras, which single precision cannot represent, with a note."""
+    """Return poses without the offset of georeferenced cameras, which single precision cannot represent, with a
+    note."""
     centres = np.array([one.camera.centre for one in poses.images])
     middle = np.median(centres, axis=0)
     radius = np.linalg.norm(centres - middle, axis=1).max()

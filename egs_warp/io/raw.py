@@ -1,4 +1,4 @@
-"""Common record into which all capture formats are decoded before they become a ``GaussianCloud``."""
+"""Common record of all capture formats, which is the result of decoding and the input of the checks."""
 
 from __future__ import annotations
 
@@ -9,46 +9,45 @@ import numpy as np
 from egs_warp.geometry.gaussians import unit_quaternions
 
 EXTREME_LOGIT = 16.0
-"""Value for an infinite opacity logit: 1 - opacity is then 1e-7, below half a step of float32 at 1."""
+"""Replacement for an infinite opacity logit: 1 - opacity is then 1e-7, about one step of float32 at 1."""
 SH_COUNTS = (0, 3, 8, 15)
-"""Number of SH coefficients above band 0 of degree 0 to 3."""
+"""Numbers of SH coefficients above band 0 for degrees 0 to 3."""
 BAND_4 = 24
-"""Number of SH coefficients above band 0 of degree 4, which is not rendered."""
+"""Number of SH coefficients above band 0 for degree 4, which is not rendered."""
 
 
 @dataclass(frozen=True)
 class RawCapture:
-    """Host arrays as the file contains them, not yet checked. Axes are the file's own."""
+    """Host arrays as in the file, not yet checked, in the axes of the file."""
 
     format: str
     """Name of the format, as shown to the user."""
     means: np.ndarray
-    """(n, 3) file units, float32; float64 if the file stores more than single precision."""
+    """(n, 3) means in file units, float32; float64 if the file stores more than single precision."""
     rotations: np.ndarray
-    """(n, 4) float32, w x y z, any length."""
+    """(n, 4) float32, quaternions w x y z of any length."""
     log_scales: np.ndarray
-    """(n, 3) float32."""
+    """(n, 3) float32, logarithms of the standard deviations."""
     opacity_logits: np.ndarray
-    """(n,) float32, may be infinite."""
+    """(n,) float32, logits of the opacities, which may be infinite."""
     sh: np.ndarray
-    """(n, (degree+1)^2, 3) float32, coefficient-major."""
+    """(n, (degree+1)^2, 3) float32, SH coefficients, band 0 first."""
     up: np.ndarray | None = None
-    """(3,) float64 unit vector, if the format or the file defines the up direction."""
+    """(3,) float64, unit up direction; None if neither the format nor the file defines it."""
     vertical_axis: int | None = None
-    """Index of the vertical axis, if the file names one without a reliable sign."""
+    """Index of the vertical axis, if the file specifies one without a reliable sign."""
     antialiased: bool = False
     """True if the file states that it was trained with antialiasing."""
     origin: np.ndarray | None = None
     """(3,) float64, file units: offset of the capture, which ``means`` do not include."""
     rows: np.ndarray | None = None
-    """(n,) indices of these Gaussians in the file; None if they are all Gaussians of the file."""
+    """(n,) indices of the Gaussians in the file; None if all Gaussians of the file were read in order."""
     notes: tuple[str, ...] = ()
     """Messages for the user about Gaussians that were left out and values that were repaired."""
 
 
 def property_names(coefficient_count: int) -> dict[str, list[str]]:
-    """Return the names, as in the INRIA .ply, of the columns of each array of ``RawCapture``, flattened to (n,
-    columns)."""
+    """Return, for each array of ``RawCapture`` flattened to (n, columns), the names of its columns in an INRIA .ply."""
     rest = coefficient_count - 1
     return {
         "means": ["x", "y", "z"],
@@ -60,13 +59,14 @@ def property_names(coefficient_count: int) -> dict[str, list[str]]:
 
 
 def full_bands(rest: int) -> int:
-    """Return how many of ``rest`` SH coefficients above band 0 make up complete bands that are rendered: 0, 3, 8 or
-    15."""
+    """Return the number of SH coefficients in the complete rendered bands among ``rest`` coefficients above band 0: 0,
+    3, 8 or 15."""
     return max(count for count in SH_COUNTS if count <= rest)
 
 
 def bands_note(rest: int) -> tuple[str, ...]:
-    """Return the note for the user if only ``full_bands`` of ``rest`` SH coefficients are read; none if all are."""
+    """Return a note for the user if only ``full_bands`` of ``rest`` SH coefficients are read; no note if all are
+    read."""
     extra = rest - full_bands(rest)
     if not extra:
         return ()
@@ -76,14 +76,14 @@ def bands_note(rest: int) -> tuple[str, ...]:
 
 
 def logits_from_bytes(alphas: np.ndarray) -> np.ndarray:
-    """Float32 opacity logits of opacities stored as uint8 / 255; 0 and 255 give -+``EXTREME_LOGIT``."""
+    """Return the float32 logits of opacities stored as uint8 / 255; 0 and 255 give -+``EXTREME_LOGIT``."""
     opacity = np.arange(1, 255) / 255.0
     table = np.concatenate([[-EXTREME_LOGIT], np.log(opacity / (1.0 - opacity)), [EXTREME_LOGIT]])
     return table.astype(np.float32)[alphas]
 
 
 def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
-    """Float32 opacity logits of opacities of 0 to 1; both ends give -+``EXTREME_LOGIT``."""
+    """Return the float32 logits of opacities from 0 to 1; 0 and 1 give -+``EXTREME_LOGIT``."""
     values = opacities.astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         logits = np.log(values) - np.log1p(-values)
@@ -91,18 +91,18 @@ def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
 
 
 def bytes_from_logits(logits: np.ndarray) -> np.ndarray:
-    """Opacities as uint8, 255 for 1."""
+    """Return the opacities of ``logits`` as uint8, where 255 represents 1."""
     return byte(255.0 / (1.0 + np.exp(-np.clip(logits.astype(np.float64), -100.0, 100.0))))
 
 
 def byte(values: np.ndarray) -> np.ndarray:
-    """Values rounded and clamped to 0 ... 255, uint8."""
+    """Return ``values`` rounded and clamped to 0 ... 255, as uint8."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 def largest_dropped(quaternions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, 3) the three smaller components in order, with signs such that the largest is positive, and (n,)
-    uint32 the index of the largest."""
+    """Return the three components (n, 3) other than the largest one, with signs such that the largest is positive, and
+    the index (n,) uint32 of the largest component."""
     unit = unit_quaternions(quaternions).astype(np.float64)
     largest = np.argmax(np.abs(unit), axis=1)
     rows = np.arange(len(unit))
@@ -113,7 +113,7 @@ def largest_dropped(quaternions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def largest_restored(three: np.ndarray, largest: np.ndarray) -> np.ndarray:
-    """Inverse of ``largest_dropped``: (n, 4) float32 unit quaternions."""
+    """Return unit quaternions (n, 4) float32; inverse of ``largest_dropped``."""
     quaternions = np.empty((len(three), 4))
     is_smaller = np.ones(quaternions.shape, bool)
     rows = np.arange(len(three))
@@ -124,6 +124,6 @@ def largest_restored(three: np.ndarray, largest: np.ndarray) -> np.ndarray:
 
 
 def bit_field(words: np.ndarray, shift: int, bits: int) -> np.ndarray:
-    """Extract ``bits`` bits of uint32 ``words`` from ``shift`` up, as 0 ... 1 in float64."""
+    """Extract ``bits`` bits of uint32 ``words``, from bit ``shift`` upwards, scaled to 0 ... 1 in float64."""
     mask = (1 << bits) - 1
     return ((words >> np.uint32(shift)) & np.uint32(mask)) / mask

@@ -1,8 +1,9 @@
 """Camera parameters of RealityScan and RealityCapture (*Internal/External camera parameters*, .csv).
 
-Columns: name, x, y, alt, heading, pitch, roll, f, px, py, k1 to k4, t1, t2. Angles are in degrees, ``f`` is the focal
-length for a longer side of 36, and ``px`` and ``py`` are the offset of the principal point in longer sides. The camera
-looks along its own -z axis, with y up, after the rotation Rz(-heading) Rx(pitch) Ry(roll).
+The columns are name, x, y, alt, heading, pitch, roll, f, px, py, k1 to k4, t1 and t2. Angles are in degrees. ``f`` is
+the focal length in mm if the longer side is 36 mm, and ``px`` and ``py`` are the offset of the principal point relative
+to the longer side. In the camera's axes, the optical axis is -z and y points up; Rz(-heading) Rx(pitch) Ry(roll)
+rotates these axes to the world.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from egs_warp.io.posed_images import (
 from egs_warp.io.text import decimal_number, decode_text
 
 _FILM_WIDTH = 36.0
-"""Longer side for which ``f`` is given, mm."""
+"""Longer side to which ``f`` refers, mm."""
 _SEPARATORS = (";", "\t", ",")
 _OTHER_NAMES = {"z": "alt", "altitude": "alt"}
 _REQUIRED = ("x", "y", "alt", "heading", "pitch", "roll", "f")
@@ -38,8 +39,8 @@ _EXPORT = "export Internal/External camera parameters"
 def read_reality_scan(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], list[ExcludedPhoto]]:
     """Read the cameras of a .csv, and find their photos and masks in ``files``.
 
-    Invalid rows, and photos that cannot be read, are excluded: only the photo contains its size. Raises ``UserError``
-    for a file that is malformed or has no valid camera.
+    Invalid rows are excluded, and so are photos that cannot be read, because only the photos contain their sizes.
+    Raises ``UserError`` for a file that is malformed or has no valid camera.
     """
     text = decode_text(read_bytes(source, at_most=MAX_TEXT_BYTES), source)
     lines = text.splitlines()
@@ -76,7 +77,7 @@ def _words(line: str) -> set[str]:
 
 
 class _Row:
-    """Checked access to one line."""
+    """Checked access to one row of the file."""
 
     def __init__(self, source: Path, line: int, columns: list[str], fields: list[str]) -> None:
         self.where = f"{source}: line {line}"
@@ -84,7 +85,7 @@ class _Row:
         self._columns, self._fields = columns, fields
 
     def numbers(self, names: tuple[str, ...]) -> list[float]:
-        """Return the numbers of columns; 0 for those that are missing."""
+        """Return the numbers in the columns ``names``; 0 for missing columns."""
         if len([field for field in self._fields if field.strip()]) > len(self._columns):
             raise UserError(
                 f"{self.where} has {len(self._fields)} fields, but there are {len(self._columns)} columns; export"
@@ -131,7 +132,7 @@ def _posed(row: _Row, place: PhotoAndMask) -> PosedImage:
 
 
 def _turn(axis: int, degrees: float) -> np.ndarray:
-    """(3, 3) rotation about a coordinate axis, counterclockwise seen from its tip."""
+    """Return the rotation (3, 3) about a coordinate axis, counterclockwise as seen from the tip of the axis."""
     cosine, sine = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     first, second = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.eye(3)

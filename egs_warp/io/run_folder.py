@@ -1,7 +1,7 @@
-"""Folder of the results of one run: it is locked while it is written, and described by a manifest that is written last.
+"""Folder with the results of one run: it is locked during the run, and its manifest is completed last.
 
 ``manifest.json`` contains ``schema``, ``version``, ``command``, ``finished`` and ``files``. ``files`` maps the name of
-each file, including those in folders of the run, to its size and SHA-256. For an unfinished run it maps the names of
+each file, including files in folders of the run, to its size and SHA-256. In an unfinished run, it maps the names of
 files and folders to null.
 """
 
@@ -24,17 +24,17 @@ from egs_warp.version import __version__
 
 MANIFEST = "manifest.json"
 CONFIG = "run.yaml"
-"""File with the flags of a run, from which the command resumes it."""
+"""Name of the file with the flags of a run, from which the command resumes the run."""
 ANIMATE = "animate"
-"""The command whose runs can be resumed."""
+"""Name of the command whose runs can be resumed."""
 _LOCK = ".egs-run.lock"
 _SCHEMA = 1
 _FILE_ENDINGS = (".mp4", ".mov", ".webm", ".png", ".ply", ".spz", ".splat", ".sog", ".glb", ".json", ".npz", ".yaml")
-"""Endings of file names, which the name of a folder of results may not have."""
+"""Endings of file names, with which the name of a run folder must not end."""
 
 
 class RunFolder:
-    """Output of one run, created by ``run_folder``."""
+    """Output folder of one run, created by ``run_folder``."""
 
     def __init__(
         self, path: Path, *, command: str = ANIMATE, overwrite: bool = False, names: Sequence[str] = ()
@@ -49,14 +49,13 @@ class RunFolder:
         self._begin: Callable[[], object] | None = None
 
     def begin_with(self, begin: Callable[[], object]) -> None:
-        """Call ``begin``, which writes files, before any other file is written, so that an interrupted run has them. A
-        resumed run has them already, so it does not call ``begin``."""
+        """Call ``begin``, which writes files, before any other file is written, so that an interrupted run contains
+        these files. A resumed run contains them already and does not call ``begin``."""
         if not self.resumed:
             self._begin = begin
 
     def file(self, name: str) -> Path:
-        """Return the path of the run's file ``name``. Before the first one, an earlier run is backed up, if that is
-        allowed.
+        """Return the path of the file ``name`` of the run. The first call backs up an earlier run, if that is allowed.
 
         Raises ``UserError`` for an existing file of this name that belongs to no run, unless files may be overwritten.
         """
@@ -75,13 +74,13 @@ class RunFolder:
         return self.path / name
 
     def folder(self, name: str) -> Path:
-        """Return the path of the run's folder ``name``, like ``file``. All files in it are results."""
+        """Return the path of the folder ``name`` of the run, like ``file``. All files in it are results."""
         self._result_folders.add(name)
         return self.file(name)
 
     def finish(self) -> None:
-        """Write the final manifest, which describes all files and marks the run as finished. Folders of ``file``,
-        needed only for resuming, are removed; those of ``folder`` stay."""
+        """Write the final manifest, which describes all files and marks the run as finished. Folders with paths from
+        ``file``, which are needed only for resuming, are removed; folders with paths from ``folder`` are kept."""
         files = {name: self.path / name for name in self._names}
         for name in self._result_folders:
             files |= {path.relative_to(self.path).as_posix(): path for path in sorted(files[name].rglob("*"))}
@@ -90,7 +89,7 @@ class RunFolder:
         for name in self._names:
             if name not in facts and name not in self._result_folders:
                 shutil.rmtree(self.path / name, ignore_errors=True)
-        # Leftovers of the interrupted run may have been too young when this one started.
+        # Leftovers of an interrupted run may have been too young to be removed when this run started.
         sweep_all(self.path)
 
     def _write_manifest(self, files: dict[str, Any], *, finished: bool) -> None:
@@ -101,7 +100,7 @@ class RunFolder:
 
 
 def back_up(folder: Path, names: Sequence[str]) -> None:
-    """Move the existing files ``names`` into the first unused folder of ``earlier-1``, ``earlier-2``, ... in
+    """Move the existing files ``names`` into the first unused subfolder ``earlier-1``, ``earlier-2``, ... of
     ``folder``.
 
     Raises ``UserError`` if that fails.
@@ -115,7 +114,7 @@ def back_up(folder: Path, names: Sequence[str]) -> None:
     backup = folder / f"earlier-{number}"
     try:
         backup.mkdir()
-        # The manifest is moved last: until then it lists the files that are still to be moved.
+        # Move the manifest last, because it lists the files that have not been moved yet.
         for name in existing:
             os.replace(folder / name, backup / name)
     except OSError as error:
@@ -128,8 +127,7 @@ def back_up(folder: Path, names: Sequence[str]) -> None:
 def run_folder(
     out: Path | str | RunFolder, *, command: str = ANIMATE, overwrite: bool = False, resume: bool = False
 ) -> Iterator[RunFolder]:
-    """Open the folder ``out`` for one run of ``command``, creating and locking it; a ``RunFolder`` is returned
-    unchanged.
+    """Create and lock the folder ``out`` for one run of ``command``; a ``RunFolder`` is yielded unchanged.
 
     Raises ``UserError`` if another run is writing, if an earlier run exists and may not be backed up (``overwrite``),
     or if there is no interrupted run to ``resume``.
@@ -148,15 +146,15 @@ def run_folder(
 
 
 def clean_up(out: Path | str, scratch: str) -> None:
-    """Remove leftovers in the folder ``out`` of a run that was killed at its end: its folder ``scratch``, its lock,
-    unfinished files. Nothing is removed while a run is active."""
+    """Remove the leftovers in the folder ``out`` of a run that was killed at its end: the folder ``scratch``, the lock
+    and unfinished files. Nothing is removed while a run is active."""
     folder = Path(out)
     try:
         with lock(folder / _LOCK) as acquired:
             if acquired:
                 shutil.rmtree(folder / scratch, ignore_errors=True)
                 sweep(folder)
-    # Leftovers that the process has no permission to remove are kept.
+    # Leftovers are kept if the process has no permission to remove them.
     except OSError:
         pass
 
@@ -169,7 +167,7 @@ def _check(out: Path | str, *, overwrite: bool, resume: bool) -> None:
 
 
 def is_interrupted(folder: Path) -> bool:
-    """Return True if a run of ``animate`` in ``folder`` has written files, but not all of them."""
+    """Return True if a run of ``animate`` in ``folder`` has written some files but has not finished."""
     manifest = _manifest(folder) if (folder / MANIFEST).is_file() else None
     if not isinstance(manifest, dict) or manifest.get("finished") is not False or _is_unfinished(folder):
         return False
@@ -177,8 +175,8 @@ def is_interrupted(folder: Path) -> bool:
 
 
 def has_finished(out: Path | str) -> bool:
-    """Return True if the run in the folder ``out`` has written all of its files. Raises ``UserError`` if there is no
-    run that can be resumed, or one of another version."""
+    """Return True if the run in the folder ``out`` has finished. Raises ``UserError`` if there is no run that can be
+    resumed, or if it belongs to another version."""
     check_out(out)
     path = Path(out) / MANIFEST
     if not path.is_file() or _is_unfinished(Path(out)):
@@ -200,8 +198,8 @@ def has_finished(out: Path | str) -> bool:
 
 
 def check_run_folder(out: Path | str, *, overwrite: bool = False, writes: Sequence[str] = ()) -> None:
-    """Raise the ``UserError`` of ``run_folder``, and that of the files that the run ``writes``, as far as it can be
-    predicted, before any long computation and without creating anything."""
+    """Raise the errors of ``run_folder``, and of its method ``file`` for the files that the run ``writes``, as far as
+    they can be predicted, before any long computation and without creating anything."""
     check_out(out)
     if Path(out).suffix.lower() in _FILE_ENDINGS and not Path(out).is_dir():
         problem = f"the results are a folder of files; give a name without {Path(out).suffix}"
@@ -216,7 +214,7 @@ def check_run_folder(out: Path | str, *, overwrite: bool = False, writes: Sequen
 
 
 def check_no_file_of_a_run(path: Path | str) -> None:
-    """Raise ``UserError`` if ``path`` is a file of a run: its checksum would become wrong."""
+    """Raise ``UserError`` if ``path`` is a file of a run, whose checksum would become invalid."""
     path = Path(path)
     if path.exists() and (path.parent / MANIFEST).is_file() and path.name in _known(path.parent):
         raise UserError(f"{path}: is a file of the run in {path.parent}; choose another name")
@@ -239,7 +237,7 @@ def _exists(path: Path) -> bool:
         path.lstat()
     except (FileNotFoundError, NotADirectoryError):
         return False
-    # Names that are too long or contain null bytes.
+    # Raised for names that are too long or contain null bytes.
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise UserError(f"{path}: cannot be created ({reason}); choose another place") from error
@@ -260,7 +258,7 @@ def _known(folder: Path) -> list[str]:
 
 def _is_unfinished(folder: Path) -> bool:
     """Return True if the run in ``folder`` was killed after it wrote its manifest and before it wrote any other file.
-    Such a run does not count."""
+    Such a run is ignored."""
     manifest = _manifest(folder)
     names = _names_in(manifest)
     unfinished = isinstance(manifest, dict) and manifest.get("finished") is False
@@ -276,7 +274,7 @@ def _manifest(folder: Path) -> Any:
 
 
 def _names_in(manifest: Any) -> list[str]:
-    """Return the files and folders that a manifest lists, without those of other folders."""
+    """Return the files and folders that a manifest lists, without paths outside the folder of the run."""
     files = manifest.get("files") if isinstance(manifest, dict) else None
     names = files if isinstance(files, dict) else {}
     first = dict.fromkeys(part for name in names for part in PurePosixPath(name).parts[:1])

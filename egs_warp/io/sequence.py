@@ -1,4 +1,4 @@
-"""Numbered captures, which SuperSplat and the PlayCanvas player show as an animation: writing and finding them."""
+"""Writing and finding of numbered captures, which SuperSplat and the PlayCanvas player show as an animation."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def write_ply_sequence(
     """Write ``frame0001.ply``, ``frame0002.ply``, ... into ``folder``, which is created if missing. Returns their
     paths.
 
-    ``clouds`` may be a generator: only one frame is in memory at a time. ``compressed`` files are a quarter as large
-    and end in ``.compressed.ply``. Files of an earlier, longer sequence stay. Raises ``UserError`` if a file cannot be
-    written.
+    ``clouds`` may be a generator, so that only one frame is in memory at a time. ``compressed`` files have a quarter of
+    the size and end in ``.compressed.ply``. Surplus files of an earlier, longer sequence are not removed. Raises
+    ``UserError`` if a file cannot be written.
     """
     target = writable_folder(folder)
     paths = []
@@ -37,11 +37,11 @@ def write_ply_sequence(
 
 
 def frame_paths(folder: Path | str, numbers: Iterable[int], ending: str, *, alone: bool = True) -> list[Path]:
-    """Return the paths ``frame0000`` + ``ending`` and so on in ``folder``, which is created if missing, one for each of
-    ``numbers``.
+    """Return the path, such as ``frame0000`` + ``ending``, of each of ``numbers`` in ``folder``, which is created if
+    missing.
 
-    With ``alone``, raises ``UserError`` if it contains other frames with this ending, which players would show between
-    them.
+    With ``alone``, raises ``UserError`` if the folder contains other frames with this ending, because players would
+    show them as part of the sequence.
     """
     if (Path(folder) / MANIFEST).is_file():
         raise UserError(
@@ -66,8 +66,8 @@ def numbered_captures(folder: Path | str) -> list[Path]:
     """Return the files of a sequence in ``folder``, in the order of their numbers: ``frame0001.ply``,
     ``frame0002.ply``, ...
 
-    Gaps are allowed; files with other names are ignored. ``read_capture`` reads each. Raises ``UserError`` if there are
-    none, or those of two sequences.
+    Gaps are allowed; files with other names are ignored. ``read_capture`` can read each file. Raises ``UserError`` if
+    there are no such files, or files of two sequences.
     """
     place = Path(folder)
     if not place.is_dir():

@@ -13,12 +13,12 @@ from egs_warp.io.glb import write_container
 _TYPES = {np.dtype("<f4"): 5126, np.dtype("<u2"): 5123, np.dtype("<u4"): 5125}
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _VERTICES, _INDICES = 34962, 34963
-"""Targets of buffer views."""
+"""Targets of buffer views for vertices and for indices."""
 
 
 @dataclass(frozen=True)
 class SkinnedMesh:
-    """A mesh of V vertices, moved by N joints over K key frames; metres, y up."""
+    """A mesh of V vertices that N joints move over K key frames; metres, y up."""
 
     name: str
     vertices: np.ndarray
@@ -26,28 +26,28 @@ class SkinnedMesh:
     normals: np.ndarray
     """(V, 3) unit normals at rest."""
     faces: np.ndarray
-    """(F, 3) vertices of the triangles."""
+    """(F, 3) vertex indices of the triangles."""
     joints: np.ndarray
-    """(V, 4) joints that move each vertex."""
+    """(V, 4) indices of the joints that move each vertex."""
     weights: np.ndarray
-    """(V, 4) their weights, at least 0, of sum 1."""
+    """(V, 4) non-negative weights of these joints, with sum 1."""
     rest_joints: np.ndarray
     """(N, 3) positions of the joints at rest."""
     times: np.ndarray
-    """(K,) s."""
+    """(K,) s, times of the key frames."""
     root_rotations: np.ndarray
-    """(K, 4) x, y, z, w, rotation of the whole body."""
+    """(K, 4) quaternions x, y, z, w, rotation of the whole body."""
     root_positions: np.ndarray
-    """(K, 3) image of the origin by the motion of the whole body."""
+    """(K, 3) translation of the whole body after the rotation."""
     joint_positions: np.ndarray
-    """(K, N, 3) positions of the joints before that motion."""
+    """(K, N, 3) positions of the joints before the rotation and translation of the whole body."""
 
 
 def write_skinned_glb(path: Path, mesh: SkinnedMesh) -> None:
     """Write ``mesh`` as a skin with one animation. Raises ``UserError`` if the file cannot be written.
 
-    Joints translate, so that four barycentric weights move a vertex exactly as its tetrahedron does. They are children
-    of one joint that rotates with the body, and so the normals rotate with it, too.
+    The joints only translate, so that four barycentric weights move a vertex exactly like its tetrahedron. They are
+    children of one joint that rotates with the body, so that the normals rotate, too.
     """
     buffer = _Buffer()
     count = len(mesh.rest_joints)
@@ -59,7 +59,7 @@ def write_skinned_glb(path: Path, mesh: SkinnedMesh) -> None:
     }
     primitive = {"attributes": attributes, "indices": buffer.add(mesh.faces.reshape(-1, 1), "<u4", target=_INDICES)}
     inverse = np.tile(np.eye(4), (count, 1, 1))
-    # Matrices of glTF are stored column by column.
+    # Matrices are stored in column-major order in glTF.
     inverse[:, 3, :3] = -mesh.rest_joints
     skin = {
         "joints": list(range(2, 2 + count)),
@@ -104,7 +104,7 @@ class _Buffer:
     def add(
         self, values: np.ndarray, dtype: str = "<f4", *, target: int | None = None, has_bounds: bool = False
     ) -> int:
-        """Add ``values`` (n, components); return the number of the accessor."""
+        """Add ``values`` (n, components) and return the index of the accessor."""
         stored = np.ascontiguousarray(values, np.dtype(dtype))
         piece = stored.tobytes()
         view: dict[str, Any] = {"buffer": 0, "byteOffset": self._start, "byteLength": len(piece)}

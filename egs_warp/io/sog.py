@@ -1,8 +1,9 @@
 """SOG: Gaussians as pixels of WebP images described by meta.json, in a folder or in a zip (.sog).
 
 Public description: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog (version 2, code books)
-and https://github.com/playcanvas/sogs (version 1, linear ranges). The axes stay those of the file. The description says
-+y is up, but its own tool keeps the axes of the .ply it reads, so the direction is unreliable.
+and https://github.com/playcanvas/sogs (version 1, linear ranges). The axes of the file are kept. According to the
+description, +y is up, but the tool of its authors keeps the axes of the .ply that it reads, so the up direction is
+unreliable.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _SH_COUNTS = (*SH_COUNTS, BAND_4)
 LABELS_PER_ROW = 64
 _MAX_LABELS = 1 << 16
 _PIXELS_PER_VALUE, _FREE_PIXELS = 2, 1 << 12
-"""Maximum number of pixels per value of a picture, and the number of additional pixels."""
+"""Maximum number of pixels of a picture: per value, and in addition."""
 FIRST_TAG = 252
 
 
@@ -38,11 +39,11 @@ class SogFiles:
     missing or corrupted."""
 
     def image(self, name: str, count: int) -> np.ndarray:
-        """(pixels, 4) uint8 RGBA of an image of ``count`` values, row by row from the top, lossless."""
+        """Return the pixels (pixels, 4) uint8 RGBA of a lossless image of ``count`` values, row by row from the top."""
         return self.image_rows(name, at_most=_PIXELS_PER_VALUE * count + _FREE_PIXELS).reshape(-1, 4)
 
     def image_rows(self, name: str, *, at_most: int) -> np.ndarray:
-        """(height, width, 4) uint8 RGBA of an image of at most ``at_most`` pixels."""
+        """Return the pixels (height, width, 4) uint8 RGBA of an image of at most ``at_most`` pixels."""
         # Imported here because only this format needs it.
         from PIL import Image
 
@@ -53,7 +54,7 @@ class SogFiles:
         try:
             with Image.open(io.BytesIO(data)) as image:
                 return np.asarray(image.convert("RGBA"))
-        # The decoder reads untrusted bytes, and its errors share no base class.
+        # The decoder reads untrusted bytes, and its errors have no common base class.
         except Exception as error:
             raise UserError(f"{self.source}: {name} is not a readable image; export the capture again") from error
 
@@ -69,7 +70,7 @@ class SogMeta:
             raise UserError(f"{source}: meta.json is not readable JSON; copy or export the capture again") from error
 
     def entry(self, *keys: str) -> object:
-        """Return the value under nested ``keys``, or None."""
+        """Return the value under nested ``keys``; None if there is none."""
         value: object = self.tree
         for key in keys:
             value = value.get(key) if isinstance(value, dict) else None
@@ -77,12 +78,12 @@ class SogMeta:
 
     @property
     def antialiased(self) -> bool:
-        """True if the capture was trained with antialiasing: ``antialias`` of the description, ``model`` of
-        splat-transform."""
+        """True if the capture was trained with antialiasing: entry ``antialias`` according to the description, or entry
+        ``model`` of splat-transform."""
         return self.entry("antialias") is True or self.entry("model") == "antialiased"
 
     def numbers(self, *keys: str, count: int) -> np.ndarray:
-        """(count,) float64, finite."""
+        """Return the finite numbers (count,) float64 under nested ``keys``."""
         value = self.entry(*keys)
         values = value if isinstance(value, list) else [value]
         numbers = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e38]
@@ -91,7 +92,8 @@ class SogMeta:
         return np.array(numbers, dtype=np.float64)
 
     def code_book(self, key: str) -> np.ndarray:
-        """(256,) float64. An early writer left the first entry empty; it is then extrapolated from the others."""
+        """Return the code book (256,) float64. If its first entry is empty, as in files of an early writer, the entry
+        is extrapolated."""
         book = self.entry(key, "codebook")
         if isinstance(book, list) and len(book) == 256 and book[0] is None:
             rest = SogMeta(json.dumps({key: {"codebook": book[1:]}}).encode(), self.source)
@@ -100,14 +102,14 @@ class SogMeta:
         return self.numbers(key, "codebook", count=256)
 
     def files(self, key: str, count: int) -> list[str]:
-        """Return ``count`` file names."""
+        """Return the ``count`` file names of the entry ``key``."""
         names = self.entry(key, "files")
         if not isinstance(names, list) or len(names) != count or not all(isinstance(name, str) for name in names):
             raise self._wrong(key, "files", expected=f"{count} file names")
         return names
 
     def integer(self, *keys: str) -> int:
-        """Return the integer of at least 0 under ``keys``."""
+        """Return the non-negative integer under nested ``keys``."""
         value = self.entry(*keys)
         if not isinstance(value, int) or isinstance(value, bool) or value < 0:
             raise self._wrong(*keys, expected="an integer of at least 0")
@@ -118,7 +120,7 @@ class SogMeta:
 
 
 def decode_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
-    """Decode a SOG of version 1 or 2. Raises ``UserError`` for one that is incomplete or malformed."""
+    """Decode a SOG of version 1 or 2. Raises ``UserError`` if it is incomplete or malformed."""
     meta = SogMeta(meta_json, files.source)
     version = meta.integer("version") if meta.entry("version") is not None else 1
     if version not in (1, 2):
@@ -177,14 +179,17 @@ def _decode_quaternions(pixels: np.ndarray) -> np.ndarray:
     tags = pixels[:, 3].astype(np.int64) - FIRST_TAG
     three = (pixels[:, :3] / 255.0 * 2.0 - 1.0) / np.sqrt(2.0)
     quaternions = largest_restored(three, np.maximum(tags, 0))
-    # Pixels without a valid rotation get the identity.
+    # Replace invalid rotations by the identity.
     quaternions[tags < 0] = (1.0, 0.0, 0.0, 0.0)
     return quaternions
 
 
 def _decode_rest(meta: SogMeta, files: SogFiles, version: int, pixels: Callable[[str], np.ndarray]) -> np.ndarray:
-    """(n, K-1, 3) coefficients, from a palette of coefficient sets, 64 per row of its image, and the index of each
-    Gaussian's set in the palette."""
+    """Return the SH coefficients (n, K-1, 3) above band 0.
+
+    The file contains a palette of coefficient sets, 64 in each row of its image, and for each Gaussian an index into
+    the palette.
+    """
     centroids_name, labels_name = meta.files("shN", 2)
     centroids = files.image_rows(centroids_name, at_most=_MAX_LABELS * max(_SH_COUNTS))[:, :, :3]
     height, width = centroids.shape[:2]

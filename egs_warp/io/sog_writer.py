@@ -1,5 +1,5 @@
-"""Writing of SOG version 2 (``sog`` reads it), with code books of 256 values and a palette of SH sets computed from the
-capture."""
+"""Writing of SOG version 2 (read by ``sog``). Code books of 256 values and a palette of sets of SH coefficients are
+computed from the capture."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ _PALETTE_LEVELS = 16
 
 
 def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = False) -> np.ndarray:
-    """Write ``cloud`` as a .sog, a twentieth of the size of a .ply.
+    """Write ``cloud`` as a .sog, which has a twentieth of the size of a .ply.
 
-    The format is lossy: it rounds positions to 1/65535 of the extent (finer near the origin), rotations and opacity to
-    1/255, and scales, colours and SH to 256 values each, which are chosen for the capture. Above 65,536 Gaussians,
-    similar SH sets are merged. Gaussians are sorted in space unless ``keep_order`` is set. Returns (n,) the index in
-    ``cloud`` of each Gaussian of the file. Raises ``UserError`` if the file cannot be written.
+    The format is lossy: positions are rounded to 1/65535 of the extent (finer near the origin), rotations and opacity
+    to 1/255, and scales, colours and SH coefficients to 256 values each, which are chosen for the capture. For more
+    than 65,536 Gaussians, similar sets of SH coefficients are merged. Gaussians are sorted in space unless
+    ``keep_order`` is set. Returns the index (n,) in ``cloud`` of each Gaussian of the file. Raises ``UserError`` if the
+    file cannot be written.
     """
     means = cloud.means.numpy().astype(np.float64)
     order = np.arange(cloud.count) if keep_order else morton_order(means)
@@ -58,7 +59,7 @@ def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = Fals
         "sh0": {"codebook": colour_book.tolist(), "files": ["sh0.webp"]},
     }
     if cloud.antialiased:
-        # ``antialias`` is the entry of the format's description, ``model`` that of splat-transform.
+        # ``antialias`` is the entry according to the format's description, ``model`` is used by splat-transform.
         meta |= {"antialias": True, "model": "antialiased"}
     if cloud.sh_degree > 0:
         palette, labels = _palette(sh[:, 1:].reshape(len(sh), -1))
@@ -79,11 +80,11 @@ def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = Fals
 
 
 def _code_book(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (256,) increasing values that represent ``values`` with little squared error, and the index of each as
-    uint8.
+    """Return a code book (256,) of increasing values that represent ``values`` with small squared error, and the index
+    of each value in it as uint8.
 
-    Lloyd's algorithm in one dimension, starting from quantiles and the same number of evenly spaced values: the latter
-    preserve outliers, such as a few very large Gaussians. Up to 256 different values are represented exactly.
+    It is computed by Lloyd's algorithm in one dimension, starting from quantiles and as many evenly spaced values. The
+    latter preserve outliers, such as a few very large Gaussians. Up to 256 different values are represented exactly.
     """
     samples = np.sort(values.ravel()[:: -(-values.size // _BOOK_SAMPLES)].astype(np.float64))
     different = np.unique(values)
@@ -105,9 +106,10 @@ def _code_book(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _palette(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most 65,536 vectors (p, m) that represent ``vectors`` (n, m), and the index of each.
+    """Return a palette of at most 65,536 vectors (p, m) that represent ``vectors`` (n, m), and the index of each vector
+    in it.
 
-    Cells are split at their mean, perpendicular to the direction of largest variance, until there are enough.
+    Clusters are split at their mean, perpendicular to the direction of maximum variance, until there are enough.
     """
     count, width = vectors.shape
     if count <= 1 << _PALETTE_LEVELS:
@@ -131,7 +133,8 @@ def _palette(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _square(values: np.ndarray) -> np.ndarray:
-    """(side, side, 4) uint8 with ``values`` (n, 1 to 4) row by row; opaque if the values have no fourth column."""
+    """Return an image (side, side, 4) uint8 that contains ``values`` (n, 1 to 4) row by row; it is opaque if the values
+    have no fourth column."""
     side = int(np.ceil(np.sqrt(len(values))))
     pixels = np.zeros((side * side, 4), np.uint8)
     pixels[:, 3] = 255
@@ -140,7 +143,7 @@ def _square(values: np.ndarray) -> np.ndarray:
 
 
 def _palette_rows(centroids: np.ndarray) -> np.ndarray:
-    """(rows, 64 (K-1), 4) uint8 from (p, K-1, 3)."""
+    """Return the image (rows, 64 (K-1), 4) uint8 of the palette ``centroids`` (p, K-1, 3)."""
     count, coefficients, _ = centroids.shape
     rows = -(-count // LABELS_PER_ROW)
     pixels = np.full((rows * LABELS_PER_ROW, coefficients, 4), 255, np.uint8)
@@ -152,6 +155,6 @@ def _webp(pixels: np.ndarray) -> bytes:
     from PIL import Image
 
     data = io.BytesIO()
-    # Without exact, the encoder drops the colours of pixels whose fourth channel is 0.
+    # Without ``exact``, the encoder would drop the colours of pixels whose fourth channel is 0.
     Image.fromarray(pixels).save(data, "WEBP", lossless=True, exact=True, quality=80, method=2)
     return data.getvalue()

@@ -1,7 +1,8 @@
 """.splat: 32 bytes per Gaussian and no header.
 
 Public description: https://github.com/antimatter15/splat. Position and scale are three float32 each, colour and opacity
-four uint8, and the rotation four uint8 (w x y z, (b - 128) / 128). There is no magic number and no SH beyond band 0.
+together four uint8, and the rotation four uint8 b for w x y z, each (b - 128) / 128. There is no magic number and no SH
+band above 0.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from egs_warp.io.raw import RawCapture, byte, bytes_from_logits, logits_from_byt
 
 _ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
 SPLAT_ROW = _ROW.itemsize
-"""Bytes of one Gaussian."""
+"""Number of bytes of one Gaussian."""
 _MAX_NEGATIVE = 0.5
-"""Fraction of Gaussians with a negative scale up to which a file is taken for a .splat."""
+"""Maximum fraction of Gaussians with a negative scale in a file that is accepted as a .splat."""
 _MIN_SCALE = float(np.finfo(np.float32).tiny)
 
 
@@ -43,7 +44,7 @@ def decode_splat(data: bytes, source: Path) -> RawCapture:
             f"{source}: scale of {len(negative)} Gaussians is negative (first: number {negative[0]}); "
             "if the file is a .splat, export it again"
         )
-    # In float32, exp of less than -104 is 0: such Gaussians arrive with scale 0.
+    # In float32, exp is 0 below about -104, so Gaussians with such log scales are stored with scale 0.
     zero = int(np.count_nonzero((scales == 0).any(axis=1)))
     colour = rows["colour"]
     with np.errstate(invalid="ignore"):
@@ -60,7 +61,7 @@ def decode_splat(data: bytes, source: Path) -> RawCapture:
 
 
 def write_splat(path: Path | str, cloud: GaussianCloud) -> None:
-    """Write ``cloud`` as a .splat: band 0 of SH only; colour, opacity and rotation in 8 bits.
+    """Write ``cloud`` as a .splat, with SH band 0 only, and with colour, opacity and rotation in 8 bits.
 
     Raises ``UserError`` if the file cannot be written.
     """

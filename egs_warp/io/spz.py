@@ -1,9 +1,9 @@
 """Niantic's .spz: gzip around a 16-byte header and one block of bytes for each quantity.
 
 Public description: README of https://github.com/nianticlabs/spz. Versions 1 (half-float positions), 2 (24-bit
-fixed-point positions), 3 (smallest-three rotations) and 4 (the blocks of 3, each a Zstandard stream: ``spz_streams``)
-are read; 2 to 4 are written. The format defines its axes as right, up, back: +y is up; version 4 may specify others.
-The axes stay those of the file.
+fixed-point positions), 3 (smallest-three rotations) and 4 (the blocks of version 3 as Zstandard streams,
+``spz_streams``) are read; versions 2 to 4 are written. The format defines its axes as right, up, back, so +y is up;
+files of version 4 may specify other axes. The axes of the file are kept.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
 _COLOUR_SCALE = 0.15
 _FRACTIONAL_BITS = 12
-"""Fractional bits of a position, for captures of at least ``_SMALL`` units."""
+"""Number of fractional bits of a position, for captures of at least ``_SMALL`` units."""
 _SMALL = 0.25
 _MIN_LOG_SCALE, _LOG_SCALE_STEPS = -10.0, 16.0
-"""Log scales are stored as a byte, in steps of 1/16 from -10."""
+"""Log scale of the byte 0, and number of steps per unit: log scales are stored as a byte, in steps of 1/16 from -10."""
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 _MAX_EXTENSION_BYTES = 1 << 20
 _MAX_FRACTIONAL_BITS = 24
 _SH_COUNTS = (*SH_COUNTS, BAND_4)
-# Quantisation steps of SH coefficients above band 0, as in the reference writer: finer steps would only increase the
-# gzip size.
+# Quantisation steps of SH coefficients above band 0, as in the reference writer. Finer steps would only increase the
+# compressed size.
 _BAND1_STEP, _REST_STEP = 8, 16
 
 
@@ -62,7 +62,7 @@ class _Layout:
 
     @property
     def widths(self) -> tuple[int, ...]:
-        """Bytes of one Gaussian in each block: positions, alphas, colours, scales, rotations, SH."""
+        """Number of bytes of one Gaussian in each block: positions, alphas, colours, scales, rotations, SH."""
         return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version >= 3 else 3, 3 * self.sh_count
 
     @property
@@ -72,7 +72,7 @@ class _Layout:
 
 def decode_spz(data: bytes, source: Path) -> RawCapture:
     """Decode a .spz, gzipped or not. Raises ``UserError`` if it is corrupt, truncated or of an unknown version."""
-    # Only the size that the header declares is inflated, so that a crafted file cannot fill the memory.
+    # Inflate only the size that the header declares, so that a crafted file cannot fill the memory.
     inflate = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     gzipped = data[:2] == b"\x1f\x8b"
     header = _inflated(inflate, data, _HEADER.size, source) if gzipped else data[: _HEADER.size]
@@ -99,7 +99,7 @@ def decode_spz(data: bytes, source: Path) -> RawCapture:
 
 
 def _mirrored(raw: RawCapture) -> RawCapture:
-    """Return ``raw`` with the first axis reversed, which is to the left or to the right in all axis systems of .spz."""
+    """Return ``raw`` mirrored along its first axis, which points to the left or right in all axis systems of .spz."""
     mirror = np.diag([-1.0, 1.0, 1.0])
     rotations, log_scales = transformed_shapes(raw.rotations, raw.log_scales, mirror)
     return replace(
@@ -162,7 +162,7 @@ def _decode(body: bytes, layout: _Layout, up: np.ndarray) -> RawCapture:
         means = positions.copy().view("<f2").astype(np.float32)
     else:
         low, middle, high = positions.reshape(-1, 3, 3).astype(np.int32).transpose(2, 0, 1)
-        # Shifting up and down again extends the sign bit.
+        # The shift to the left and back extends the sign bit.
         fixed = ((low << 8 | middle << 16 | high << 24) >> 8).astype(np.float64)
         means = np.ldexp(fixed, -layout.fractional_bits).astype(np.float32)
     rest = (
@@ -198,13 +198,14 @@ def _quaternions(packed: np.ndarray, version: int) -> np.ndarray:
 
 
 def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> None:
-    """Write ``cloud`` as a .spz of version 2 to 4. Axes are written unchanged; the format's viewers take +y as up.
+    """Write ``cloud`` as a .spz of version 2 to 4. Axes are written unchanged; viewers of the format assume that +y is
+    up.
 
-    Versions 3 and 4 contain the same numbers; files of version 4 are smaller, and fewer programs read them.
+    Versions 3 and 4 contain the same numbers; files of version 4 are smaller, but fewer programs read them.
 
-    The format is lossy: positions are rounded to 2^-13 units, or 2^-13 of the size of a small capture (to fewer bits if
-    the capture reaches so far that they do not fit), log scales to 1/32 within -10 ... 5.9, and opacity and colour to
-    1/255. Raises ``UserError`` if the file cannot be written, or most Gaussians are too small or too large for it.
+    The format is lossy: positions are rounded to 2^-13 units, or to 2^-13 of the size of a small capture, with fewer
+    bits if far positions would not fit; log scales to 1/32 within -10 ... 5.9; and opacity and colour to 1/255. Raises
+    ``UserError`` if the file cannot be written, or if most Gaussians are too small or too large for the format.
     """
     if version not in (2, 3, 4):
         raise UserError(f"{path}: .spz version {version} cannot be written; choose 2, 3 or 4")
@@ -245,8 +246,8 @@ def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> No
 
 
 def _fractional_bits(means: np.ndarray, reach: float) -> int:
-    """Return the fractional bits of positions: enough for the size of the capture (the median distance from its middle,
-    in each direction), if the farthest position, at ``reach``, fits."""
+    """Return the number of fractional bits of positions. It is sufficient for the size of the capture, the median
+    distance from its middle along each axis, unless the farthest position, at ``reach``, would not fit."""
     size = 2.0 * float(np.median(np.abs(means - np.median(means, axis=0)).max(axis=1)))
     bits = _FRACTIONAL_BITS
     if 0.0 < size < _SMALL:
@@ -277,6 +278,6 @@ def _deflated(blocks: tuple[bytes, ...]) -> Iterator[bytes]:
 
 
 def _packed_rest(rest: np.ndarray) -> np.ndarray:
-    """(n, K-1, 3) uint8, quantised more coarsely than a byte."""
+    """Return the SH coefficients ``rest`` (n, K-1, 3) as uint8, quantised more coarsely than 8 bits."""
     step = np.where(np.arange(rest.shape[1]) < 3, _BAND1_STEP, _REST_STEP)[None, :, None]
     return byte(np.rint((rest * 128.0 + 128.0) / step) * step)

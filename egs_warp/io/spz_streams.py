@@ -1,9 +1,11 @@
-"""The container of .spz version 4: a plain header of 32 bytes, extensions, a table, one Zstandard stream per quantity.
+"""The container of .spz version 4: an uncompressed header of 32 bytes, extensions, a table, and one Zstandard stream
+per quantity.
 
-Public description: README of https://github.com/nianticlabs/spz. The header begins as that of versions 1 to 3; its byte
-15 is the number of streams, the next four the offset of their table, and twelve are reserved. A row of the table is two
-uint64: compressed and uncompressed bytes. The streams follow it in order. Between header and table are extensions, each
-a uint32 of its kind, one of its length, and that many bytes.
+Public description: README of https://github.com/nianticlabs/spz. The first 15 bytes of the header are the same as in
+versions 1 to 3. Byte 15 is the number of streams, the next four bytes are the offset of their table, and twelve bytes
+are reserved. A row of the table consists of two uint64: compressed and uncompressed size. The streams follow the table
+in order. Between header and table are extensions, each with a uint32 for its kind, a uint32 for its length, and its
+content.
 """
 
 from __future__ import annotations
@@ -21,23 +23,22 @@ _HEADER = struct.Struct("<IIIBBBBI12x")
 _ROW = struct.Struct("<QQ")
 _RECORD = struct.Struct("<II")
 _COMMON = 15
-"""Number of bytes that the header shares with those of versions 1 to 3."""
+"""Number of bytes at the beginning of the header that are the same as in versions 1 to 3."""
 _LEVEL = 12
-"""Level out of Zstandard's 22; 19 takes eight times as long for files that are 4 to 6 % smaller."""
+"""Compression level of Zstandard, of 22; level 19 takes eight times as long for files that are 4 to 6 % smaller."""
 _MAX_WINDOW = 1 << 27
-"""Maximum memory that a stream may need in addition to its output, bytes: the default of common tools."""
+"""Maximum memory that a stream may need in addition to its output, bytes; it is the default of common tools."""
 _COORDINATES = 0xADBE0003
-"""Extension SPZ_ADOBE_coordinate_system: a uint32 for the directions of the axes."""
+"""Kind of the extension SPZ_ADOBE_coordinate_system, which contains a uint32 for the directions of the axes."""
 _AXES = (
     *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
     *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
 )
-"""Directions of x, y and z: left or right, up or down, forward or back."""
+"""Directions of x, y and z by the value of the extension: left or right, up or down, forward or back."""
 
 
 def inflate_streams(data: bytes, sizes: Sequence[int], source: Path) -> bytes:
-    """Decompress the blocks, which have ``sizes`` bytes, and concatenate them. Raises ``UserError`` if the blocks of
-    the file have other sizes.
+    """Decompress the blocks and concatenate them. Raises ``UserError`` if their sizes in bytes are not ``sizes``.
 
     Only ``sizes`` bytes are inflated, so that a crafted file cannot fill the memory.
     """
@@ -69,17 +70,17 @@ def inflate_streams(data: bytes, sizes: Sequence[int], source: Path) -> bytes:
 def deflate_streams(header: bytes, blocks: Sequence[bytes]) -> list[bytes]:
     """Return the parts of a file that contains ``blocks``; empty blocks are left out, as the format requires.
 
-    ``header`` is that of version 3, with another version number; the part after its flags is replaced.
+    ``header`` is a header of version 3 with the version number 4; the part after its flags is replaced.
     """
     nonempty = [block for block in blocks if block]
-    # The size of the content and a checksum are included, so that damage is detected.
+    # Include the size of the content and a checksum, so that damage is detected.
     streams = [zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True).compress(block) for block in nonempty]
     table = b"".join(_ROW.pack(len(packed), len(block)) for packed, block in zip(streams, nonempty, strict=True))
     return [header[:_COMMON] + struct.pack("<BI12x", len(nonempty), _HEADER.size), table, *streams]
 
 
 def stored_axes(data: bytes, source: Path) -> tuple[np.ndarray, bool] | None:
-    """(3,) up, and True if the axes are left-handed, if an extension specifies their directions; None without one."""
+    """Return the up direction (3,), and True if the axes are left-handed; None if no extension specifies the axes."""
     table, _ = _table(data, source)
     place = _HEADER.size
     while place + _RECORD.size <= table:

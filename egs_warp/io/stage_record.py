@@ -1,7 +1,7 @@
-"""Record of the stages that have written into a folder: what each one was made from, and what it wrote.
+"""Record of the stages that have written files into a folder: their options, inputs and outputs.
 
-``stages.json`` maps the name of each stage to its ``key``, which is the SHA-256 of its options and inputs, to
-``finished``, and to ``files`` with the SHA-256 of each file that it wrote.
+``stages.json`` contains, for the name of each stage, ``key``, the SHA-256 of its options and inputs; ``finished``; and
+``files`` with the SHA-256 of each file that the stage wrote.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ class StageState(enum.Enum):
     """State of a stage for given options and inputs."""
 
     MISSING = "missing"
-    """It was never started."""
+    """The stage has never been started."""
     OTHER = "other"
-    """It was started or finished with other options or inputs, or its files were changed."""
+    """The stage has been started or finished with other options or inputs, or its files have been changed."""
     INTERRUPTED = "interrupted"
     FINISHED = "finished"
 
 
 class StageRecord:
-    """Stages in ``folder``."""
+    """Record of the stages in ``folder``."""
 
     def __init__(self, folder: Path) -> None:
         """Read the record of ``folder``, if there is one. Raises ``UserError`` if it is damaged."""
@@ -46,7 +46,7 @@ class StageRecord:
         self._stages: dict[str, Any] = tree
 
     def state(self, stage: str, key: str) -> StageState:
-        """Return the state of ``stage`` for the options and inputs of ``key``."""
+        """Return the state of ``stage`` for the options and inputs with this ``key``."""
         entry = self._stages.get(stage)
         if entry is None:
             return StageState.MISSING
@@ -59,7 +59,7 @@ class StageRecord:
         return StageState.FINISHED if is_whole else StageState.OTHER
 
     def begin(self, stage: str, key: str) -> None:
-        """Record that ``stage`` is started."""
+        """Record that ``stage`` has been started."""
         self._write(stage, {"key": key, "finished": False, "files": {}})
 
     def finish(self, stage: str, key: str, files: Iterable[Path]) -> None:
@@ -76,7 +76,7 @@ class StageRecord:
 def stage_key(options: Mapping[str, Any], inputs: Iterable[Path]) -> str:
     """Return the SHA-256 of ``options``, which are JSON values, and of the contents of ``inputs``.
 
-    An input is a file or a folder, of which all files count that are not hidden, with their names.
+    An input is a file or a folder. The key depends on names and contents of all files in a folder that are not hidden.
     """
     whole = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
     for path in inputs:
@@ -87,7 +87,7 @@ def stage_key(options: Mapping[str, Any], inputs: Iterable[Path]) -> str:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """Return the files below ``folder`` in a fixed order, without hidden ones and those in hidden folders."""
+    """Return the files below ``folder`` in a fixed order, without hidden files and files in hidden folders."""
     found = (path for path in folder.rglob("*") if path.is_file())
     return sorted(path for path in found if not any(part.startswith(".") for part in path.relative_to(folder).parts))
 

@@ -1,4 +1,4 @@
-"""Streamed SOG: lod-meta.json, a tree whose leaves refer to several SOGs, one or more for each level of detail.
+"""Streamed SOG: a tree in lod-meta.json whose leaves refer to parts of SOGs, for each level of detail.
 
 Public description: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats (streamed SOG). Level 0 is
 the finest; each leaf is read at its finest level.
@@ -64,7 +64,7 @@ def _part(files: SogFiles, name: str, ranges: list[tuple[int, int]]) -> RawCaptu
     part = decode_sog(files.read(name), SogFiles(files.source, lambda file: files.read(str(folder / file))))
     if max(end for _, end in ranges) > len(part.means):
         raise UserError(f"{files.source}: truncated: {name} has {len(part.means)} Gaussians; export the capture again")
-    # Check this before indices are allocated: there may be many overlapping leaves.
+    # Check this before indices are allocated, because there may be many overlapping leaves in a crafted file.
     if sum(end - start for start, end in ranges) > len(part.means):
         raise UserError(f"{files.source}: leaves of {name} overlap in lod-meta.json; export the capture again")
     chosen = np.concatenate([np.arange(start, end) for start, end in ranges])

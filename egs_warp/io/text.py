@@ -1,4 +1,4 @@
-"""Small files written by users, read with one-line error messages."""
+"""Reading of small files written by users, with one-line error messages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from egs_warp.errors import UserError
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 
 _EXACT_DIGITS = 15
-"""Integers of this many digits are exact as floats, too."""
+"""Maximum number of digits of integers that are always exact as floats."""
 
 
 def read_text(path: Path | str) -> str:
@@ -40,7 +40,8 @@ def decimal_number(word: str) -> float:
 
 
 def whole_number(digits: str) -> int | float:
-    """Parse ``digits``. Numbers of many digits become floats, possibly infinite, which every range check rejects."""
+    """Parse an integer. More than ``_EXACT_DIGITS`` digits give a float, possibly infinite, outside every valid
+    range."""
     return int(digits) if len(digits) <= _EXACT_DIGITS else float(digits)
 
 

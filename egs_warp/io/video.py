@@ -1,4 +1,5 @@
-"""Images and videos on disk, written atomically: to a temporary file in the same folder, which is then renamed."""
+"""Writing of images and videos. Files are written atomically: to a temporary file in the same folder, which is then
+renamed."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from egs_warp.io.atomic import atomic_write, system_error
 
 
 def write_png(path: Path | str, image: np.ndarray) -> None:
-    """Write (H, W, 3) uint8 RGB, (H, W, 4) RGBA or (H, W) grey. Raises ``UserError`` if the file cannot be written."""
+    """Write a PNG from ``image``: (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) grey. Raises ``UserError`` if the file cannot
+    be written."""
     import cv2
 
     swap = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
@@ -32,9 +34,9 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
 
 
 def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[str]) -> np.ndarray:
-    """(rows * H, columns * W, 3) uint8: the frames side by side, each with its label in its upper left corner.
+    """Return a contact sheet (rows * H, columns * W, 3) uint8: the frames with labels in their upper left corners.
 
-    Frames smaller than the largest height H and width W are centred in a white cell.
+    H and W are the maximum height and width; smaller frames are centred in a white cell.
     """
     import cv2
 
@@ -56,7 +58,7 @@ def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[s
             max(1, round(1.4 * size)),
             cv2.LINE_AA,
         )
-        # Dark letters with a light rim are legible on any background.
+        # Dark letters with a light outline are legible on any background.
         cell = _in_the_middle(frame, height, width)
         for colour, mask in ((255.0, cv2.dilate(letters, rim)), (20.0, letters)):
             cell = cell + mask[..., None] / 255.0 * (colour - cell)
@@ -66,7 +68,7 @@ def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[s
 
 
 def _in_the_middle(frame: np.ndarray, height: int, width: int) -> np.ndarray:
-    """(height, width, 3) float32."""
+    """Return ``frame`` in the middle of a white cell (height, width, 3) float32."""
     cell = np.full((height, width, 3), 255.0, dtype=np.float32)
     top, left = (height - frame.shape[0]) // 2, (width - frame.shape[1]) // 2
     cell[top : top + frame.shape[0], left : left + frame.shape[1]] = frame
@@ -74,7 +76,7 @@ def _in_the_middle(frame: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def ffmpeg_program() -> str:
-    """Return the path of the ffmpeg program. Raises ``UserError``, before any long computation, if none runs."""
+    """Return the path of the ffmpeg program. Raises ``UserError`` if there is none that runs."""
     import imageio_ffmpeg
 
     cure = "pip install imageio-ffmpeg, or set IMAGEIO_FFMPEG_EXE to an ffmpeg program"
@@ -88,26 +90,26 @@ def ffmpeg_program() -> str:
 
 
 class _AbandonedError(Exception):
-    """Internal error that ends a video that failed."""
+    """Internal error by which a failed video is discarded."""
 
 
 _TOO_LARGE = getattr(signal, "SIGXFSZ", 0)
-"""Signal that ends a program whose file exceeds the user's limit; Windows has none."""
+"""Signal that ends a program whose file exceeds the user's size limit; 0 on Windows, which has no such signal."""
 _BT709 = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709")
 _CODECS = {
     ".mp4": ("mp4", "libx264", "yuv420p", ("-preset", "medium", "-movflags", "+faststart")),
     ".mov": ("mov", "prores_ks", "yuva444p10le", ("-profile:v", "4444", "-alpha_bits", "16", "-vendor", "apl0")),
     ".webm": ("webm", "libvpx-vp9", "yuva420p", ("-b:v", "0", "-auto-alt-ref", "0", "-cpu-used", "4", "-row-mt", "1")),
 }
-"""Format, codec, pixel format and further options by the ending of a video."""
+"""Format, codec, pixel format and other options of ffmpeg, by the ending of the video."""
 
 
 class VideoWriter:
-    """Video writer through the ffmpeg program of imageio-ffmpeg: H.264 (.mp4), or with straight alpha ProRes 4444
-    (.mov) or VP9 (.webm).
+    """Video writer that uses the ffmpeg program of imageio-ffmpeg: H.264 (.mp4), ProRes 4444 (.mov) or VP9 (.webm). The
+    last two support straight alpha.
 
-    Use it as a context manager; leaving it without an exception moves the video to ``path``, otherwise nothing is left
-    behind.
+    Use it as a context manager. If the context ends without an exception, the video is moved to ``path``; otherwise
+    nothing is written.
     """
 
     def __init__(
@@ -120,8 +122,8 @@ class VideoWriter:
         quality: int = 16,
         alpha: bool = False,
     ) -> None:
-        """Prepare the command. ``quality`` is the constant rate factor of H.264 and VP9: 0 lossless, 16 hardly visible
-        loss, 51 worst.
+        """Prepare the command. ``quality`` is the constant rate factor of H.264 and VP9: 0 is lossless, 16 has hardly
+        visible losses, 51 is the worst.
 
         Raises ``UserError`` for another ending, and for ``alpha`` in an mp4.
         """
@@ -135,7 +137,7 @@ class VideoWriter:
         self._format, codec, pixels, more = _CODECS[ending]
         rate = () if codec == "prores_ks" else ("-crf", str(quality))
         self._command_tail = [
-            # Only a pipe and a file are allowed, as names may look like addresses or playlists.
+            # Allow only pipes and files, because names may look like addresses or playlists.
             *("-protocol_whitelist", "file,pipe", "-f", "rawvideo", "-pix_fmt", "rgba" if alpha else "rgb24"),
             *("-s", f"{width + width % 2}x{height + height % 2}"),
             *("-r", f"{frames_per_second:g}", "-i", "pipe:0", "-an"),
@@ -157,15 +159,15 @@ class VideoWriter:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=self._log,
-                # Ctrl-C reaches the writer, which ends ffmpeg.
+                # Ctrl-C must reach only the writer, which then ends ffmpeg.
                 start_new_session=True,
             )
             self._files = files.pop_all()
         return self
 
     def write(self, frame: np.ndarray) -> None:
-        """Append one (H, W, 3) uint8 RGB frame, with alpha (H, W, 4). An odd side is padded by repeating its last line,
-        as yuv420p needs even sides."""
+        """Append a frame (H, W, 3) uint8 RGB, or (H, W, 4) RGBA with ``alpha``. Odd sides are padded by repeating the
+        last line, because yuv420p requires even sides."""
         if frame.shape != self._shape or frame.dtype != np.uint8:
             raise UserError(
                 f"{self._path}: a frame has shape {frame.shape} and type {frame.dtype},"
@@ -187,7 +189,7 @@ class VideoWriter:
         try:
             if kind is not None:
                 self._process.kill()
-            # A failed ffmpeg is reported below, by its exit status and its message.
+            # A failure of ffmpeg is reported below, with its exit status and message.
             with contextlib.suppress(BrokenPipeError):
                 self._process.stdin.close()
             if self._process.wait() != 0 and kind is None:
@@ -201,7 +203,7 @@ class VideoWriter:
             self._abandon()
 
     def _abandon(self) -> None:
-        """Discard the video and leave an existing file at the path unchanged. The original error is not passed on,
+        """Discard the video and leave an existing file at the path unchanged. The original error is not chained,
         because it does not concern the path."""
         self._files.__exit__(_AbandonedError, _AbandonedError(), None)
 
@@ -212,7 +214,7 @@ class VideoWriter:
         return UserError(f"{self._path}: ffmpeg could not write the video ({message})")
 
     def _system_error(self) -> OSError | None:
-        """Return the error of the operating system, such as a full disk."""
+        """Return the error of the operating system that ended ffmpeg, such as a full disk; None if there was none."""
         if self._process.wait() == -_TOO_LARGE:
             return OSError(errno.EFBIG, os.strerror(errno.EFBIG))
         return system_error(self._log_text())

@@ -1,4 +1,4 @@
-"""Writing of captures in all formats, chosen by the ending of the name."""
+"""Writing of captures in the format that the ending of the name selects."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from egs_warp.io.spz import write_spz
 
 @dataclass(frozen=True)
 class CaptureWriter:
-    """Writer of one kind of splat file."""
+    """Writer for one kind of splat file."""
 
     ending: str
-    """Ending of the file's name."""
+    """Name ending of the files."""
     function: Callable[..., np.ndarray | None]
-    """Called with path and cloud, and with ``origin`` if the file stores it. Returns the number (n,) in the cloud of
-    each Gaussian of the file, or None if it keeps the order."""
+    """Function of path and cloud, and of ``origin`` if the format stores it, that writes the file. It returns the index
+    (n,) in the cloud of each Gaussian of the file, or None if the order is the same."""
     stores_origin: bool = False
-    """True if the file includes the offset of a georeferenced capture (``Capture.origin``)."""
+    """True if the format includes the offset of a georeferenced capture (``Capture.origin``)."""
 
     def stored_origin(self, origin: np.ndarray | None) -> np.ndarray | None:
-        """Return the ``origin`` (3,) of a capture if the file includes it, else None."""
+        """Return the ``origin`` (3,) of a capture if the format includes it, otherwise None."""
         return origin if self.stores_origin else None
 
     def __call__(self, path: Path, cloud: GaussianCloud, *, origin: np.ndarray | None = None) -> np.ndarray | None:
-        """Write ``cloud``, with the ``origin`` (3,) of its capture if the file includes it; return what ``function``
-        returns."""
+        """Write ``cloud``, with the ``origin`` (3,) of its capture if the format includes it, and return the result of
+        ``function``."""
         return self.function(path, cloud, origin=origin) if self.stores_origin else self.function(path, cloud)
 
 
@@ -50,19 +50,19 @@ WRITERS: dict[str, CaptureWriter] = {
     "splat": CaptureWriter(".splat", write_splat),
     "glb": CaptureWriter(".glb", write_glb, stores_origin=True),
 }
-"""Writer of each kind of splat file. A longer ending comes before a shorter one that it ends in. Of two kinds with one
-ending, the first is the default."""
+"""Writers by kind of splat file. The first match of a name's ending is used: ``.compressed.ply`` comes before ``.ply``,
+and of two kinds with the same ending, the first is the default."""
 
 
 def is_capture_name(path: Path) -> bool:
-    """Return True if ``path`` ends as a capture does; it is then the name of a file and not of a folder."""
+    """Return True if ``path`` has the ending of a capture; it is then the name of a file, not of a folder."""
     return path.name.lower().endswith(tuple(write.ending for write in WRITERS.values()))
 
 
 def writer_of(path: Path, *, kind: str | None = None) -> CaptureWriter:
-    """Return the writer for a capture at ``path``, by ``kind``, a key of ``WRITERS``, or by the ending.
+    """Return the writer for a capture at ``path``, by ``kind`` (a key of ``WRITERS``) or by the ending.
 
-    Raises ``UserError`` for a folder, for a name without a known ending, and for one with the ending of another kind.
+    Raises ``UserError`` for a folder, a name without a known ending, and a name with the ending of another kind.
     """
     endings = dict.fromkeys(write.ending for write in WRITERS.values())
     name = path.name.lower()

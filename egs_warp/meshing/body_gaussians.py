@@ -1,4 +1,4 @@
-"""Gaussians in the body's own frame and in a canonical order, as the mechanics uses them."""
+"""Gaussians for the mechanics, in the frame of the body and in a canonical order."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 
 _STEPS_PER_E = 64
-"""Number of steps per factor of e (1.6 % each) to which log scales are rounded, because those of a file lose bits when
-its unit changes."""
+"""Number of steps per factor of e (1.6 % each) to which log scales are rounded, because a change of the file's unit
+changes their last bits."""
 
 MAX_GAUSSIANS = 500_000
-"""Maximum number of Gaussians from which a body is measured (``representatives``)."""
+"""Maximum number of Gaussians that define a body (``representatives``)."""
 _WIDE = 1.0 / 64.0
-"""Width above which all Gaussians are kept, as a fraction of the body's size: one spacing of the lattice on which its
-solid is found."""
+"""Width above which all Gaussians are kept, as a fraction of the size of the body: one spacing of the lattice for its
+solid."""
 
 
 def centred(cloud: GaussianCloud) -> tuple[GaussianCloud, np.ndarray]:
-    """Move the capture to an origin amid its Gaussians; return the moved capture and the origin (3,), capture's units.
+    """Move the capture so that its origin is in the middle of its Gaussians.
 
-    Each coordinate of the origin is one of the capture's own, so a translation that single precision represents exactly
-    does not change the result.
+    Returns the moved capture and the new origin (3,) in the capture's frame and units. Each coordinate of the origin is
+    a coordinate of some Gaussian, so a translation that is exact in single precision does not change the result.
     """
     means = cloud.means.numpy().astype(np.float64)
     origin = np.sort(means, axis=0)[len(means) // 2]
@@ -37,8 +37,8 @@ def centred(cloud: GaussianCloud) -> tuple[GaussianCloud, np.ndarray]:
 
 
 def canonical_order(cloud: GaussianCloud) -> np.ndarray:
-    """(n,) indices that sort the Gaussians by their values, first by their means, so that the order in a file does not
-    matter."""
+    """Return the indices (n,) that sort the Gaussians by their values, means first, so that results do not depend on
+    the order in a file."""
     keys = np.concatenate(
         [
             cloud.sh.numpy()[:, 0].T,
@@ -48,7 +48,7 @@ def canonical_order(cloud: GaussianCloud) -> np.ndarray:
             cloud.means.numpy()[:, ::-1].T,
         ]
     )
-    # Few Gaussians agree in x and y. One sort of both is faster than one for each of the keys.
+    # Few Gaussians have equal x and y. One sort by both is faster than a sort for each key.
     first = _increasing_bits(keys[-1]) << np.uint64(32) | _increasing_bits(keys[-2])
     order = np.argsort(first)
     equal = first[order][1:] == first[order][:-1]
@@ -59,15 +59,16 @@ def canonical_order(cloud: GaussianCloud) -> np.ndarray:
 
 
 def _increasing_bits(values: np.ndarray) -> np.ndarray:
-    """(n,) uint64 below 2^32 that sort like the float32 ``values`` (n,); 0 and -0 give the same integer."""
+    """Return integers (n,) uint64 below 2^32 in the same order as the float32 ``values`` (n,); 0 and -0 give the same
+    integer."""
     bits = (values + np.float32(0.0)).view(np.uint32)
     return np.where(bits >> 31 == 1, ~bits, bits | np.uint32(1 << 31)).astype(np.uint64)
 
 
 def representatives(cloud: GaussianCloud) -> GaussianCloud:
-    """Return at most ``MAX_GAUSSIANS`` Gaussians that show the same body; the cloud itself if it has no more than that.
+    """Return at most ``MAX_GAUSSIANS`` Gaussians that represent the same body; the cloud itself if it is small enough.
 
-    All wide Gaussians remain, because a few of them show much of the surface. The others are sampled evenly.
+    All wide Gaussians are kept, because each of them covers much of the surface. The others are sampled evenly.
     """
     if cloud.count <= MAX_GAUSSIANS:
         return cloud
@@ -92,8 +93,8 @@ def find_body_frame(cloud: GaussianCloud, plane: Plane) -> BodyFrame:
 def body_gaussians(cloud: GaussianCloud, frame: BodyFrame) -> GaussianCloud:
     """Return the capture in ``frame``, with SH band 0 only, in canonical order.
 
-    The bits are the same for any order of the capture's Gaussians and, unless a size lies within single precision's
-    rounding of a step, for any unit that is a power of two.
+    The bits do not depend on the order of the capture's Gaussians. They do not depend on a factor of two in the unit
+    either, except for a scale that lies within rounding of the boundary between two steps.
     """
     rotation = Rotation.from_matrix(frame.axes)
     rotations = cloud.rotations.numpy().astype(np.float64)

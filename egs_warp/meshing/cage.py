@@ -1,4 +1,4 @@
-"""The cage: a coarse tetrahedral mesh around the object's visible volume, flat where it stands on its plane."""
+"""The cage: a coarse tetrahedral mesh around the object's visible volume, with a flat bottom on its plane."""
 
 from __future__ import annotations
 
@@ -26,58 +26,58 @@ from egs_warp.meshing.tetwild import tetwild
 _MIN_DIHEDRAL_DEGREES = 8.0
 _MIN_ENCLOSED_FRACTION = 0.9993
 _MIN_OWN_ENCLOSED_FRACTION = 0.5
-"""Minimum fraction of the object's opacity mass inside a mesh of the user's; less indicates other coordinates."""
+"""Minimum fraction of the object's opacity mass inside a user's mesh; less indicates wrong coordinates."""
 MIN_NODES, MAX_NODES = 50, 20_000
 _MAX_THICKENING = 2.5
-"""Largest ``Cage.thickening`` of an object; an object that the elements make thicker is rejected."""
+"""Maximum ``Cage.thickening``; an object that its elements would make thicker is rejected."""
 _MAX_GROWTH_STEPS = 6
 _GROWTH_SAMPLE = 20000
 _REFINEMENT_PER_STEP = 0.15
 _THIN_RADIUS = 0.56
-"""Radius in lattice cells of a rod that always contains points of a body-centred cubic lattice, whose covering radius
-is sqrt(5)/4."""
+"""Radius in lattice cells of a rod that contains points of the body-centred cubic lattice in every position. The
+covering radius of the lattice is sqrt(5)/4."""
 
 _CELL_SIZES_PER_OCTAVE = 16
-"""Number of cell sizes per factor of 2. Cell sizes are rounded to these, so that the cell does not change if a few
-lattice points are added or removed."""
+"""Number of allowed cell sizes per factor of 2. Rounding to them keeps the cell size unchanged if a few lattice points
+are added or removed."""
 
 
 class CageMethod(Enum):
-    """Mesher that makes the tetrahedra."""
+    """Method that generates the tetrahedra."""
 
     VOXEL = "voxel"
-    """Isosurface stuffing of the voxel solid: the same bits in every run. Dihedral angles are at least 10 degrees,
+    """Isosurface stuffing of the voxel solid, with equal bits in every run. Dihedral angles are at least 10 degrees,
     except where the surface meets the floor (at least 7.6 degrees in 400 random solids)."""
     TETWILD = "tetwild"
-    """fTetWild, which resolves thin parts with fewer nodes. It seeds its random numbers from the system, so two runs
-    give two meshes. VOXEL is used instead if it fails or leaves a sliver."""
+    """fTetWild, which resolves thin parts with fewer nodes. Its random numbers are seeded by the system, so two runs
+    give different meshes. If it fails or produces slivers, VOXEL is used instead."""
 
 
 @dataclass(frozen=True)
 class Cage:
-    """A tetrahedral mesh around an object, with measures of what it encloses."""
+    """A tetrahedral mesh around an object, and measures of its quality."""
 
     mesh: TetMesh
     """Tetrahedral mesh in the units and axes of the input cloud."""
     method: CageMethod | None
-    """The mesher that was used; None for a mesh of the user's."""
+    """The method that was used; None for a user's mesh."""
     min_dihedral_degrees: float
-    """Smallest dihedral angle of all tetrahedra."""
+    """Minimum dihedral angle of all tetrahedra, degrees."""
     enclosed_opacity_mass: float
-    """Fraction, by opacity, of the object's Gaussian means inside the mesh. Floaters and means below the plane do not
-    count."""
+    """Fraction of the object's opacity in Gaussians whose means are inside the mesh. Floaters and Gaussians below the
+    plane do not belong to the object."""
     floater_opacity_mass: float
-    """Fraction, by opacity, of all Gaussians that are floaters: in the air, detached from the object."""
+    """Fraction of the total opacity in floaters: Gaussians in the air, detached from the object."""
     below_plane_opacity_mass: float
-    """Fraction, by opacity, of all Gaussians whose mean lies below the plane."""
+    """Fraction of the total opacity in Gaussians whose means are below the plane."""
     dilation: float
-    """Distance by which the cage was grown beyond the occupied space, in the mesh's units."""
+    """Distance by which the cage extends beyond the occupied space, in the units of the mesh."""
     thickening: float
-    """Largest ratio of an extent of the cage, along the axes of the body's frame, to that of the object's Gaussians. It
-    is above 1 for a thin object: elements have a minimum thickness."""
+    """Maximum ratio, over the axes of the body's frame, of the extent of the cage to the extent of the object's
+    Gaussians. It is above 1 for a thin object, because elements have a minimum thickness."""
 
     def height(self, plane: Plane) -> float:
-        """Return the body height H above ``plane``, in the mesh's units."""
+        """Return the body height H above ``plane``, in the units of the mesh."""
         return float(plane.heights(self.mesh.nodes).max())
 
     def scaled(self, factor: float) -> Cage:
@@ -93,9 +93,9 @@ def build_cage(
     dilation: float = 0.005,
     method: CageMethod = CageMethod.VOXEL,
 ) -> Cage:
-    """Build a cage, in the capture's units and axes, of the part of ``cloud`` above ``plane``; see ``cage_of_body``.
+    """Build the cage of the part of ``cloud`` above ``plane``, in the axes and units of the capture (``cage_of_body``).
 
-    It is built in the body's own frame, so it follows any translation, rotation or change of unit of the capture.
+    It is built in the frame of the body, so it does not depend on the frame and unit of the capture.
     """
     near, anchor = centred(cloud)
     frame = find_body_frame(near, plane.moved(-anchor))
@@ -109,7 +109,7 @@ def build_cage(
 
 
 def check_nodes(nodes: int) -> None:
-    """Raise ``ArgumentError``, before any long computation, if no cage has this number of nodes."""
+    """Raise ``ArgumentError``, before any long computation, if a cage cannot have this number of ``nodes``."""
     if not MIN_NODES <= nodes <= MAX_NODES:
         raise ArgumentError("nodes", f"give a number from {MIN_NODES} to {MAX_NODES}", value=nodes)
 
@@ -125,14 +125,14 @@ def cage_of_body(
     """Build a cage around the opaque part of ``cloud`` above z = 0. The cage does not cross z = 0.
 
     The dilation is increased, and the mesh refined (up to 1.75 times the nodes), until all but 0.07 % of the object's
-    opacity mass is inside. The same input gives the same bits (``CageMethod.VOXEL``). See docs/concepts/cage.md.
+    opacity mass is inside. With ``CageMethod.VOXEL``, equal inputs give equal bits. See docs/concepts/cage.md.
 
     Args:
-        cloud: Gaussians in their body's frame (``body_gaussians``), whose axes and origin are those of the lattice.
+        cloud: Gaussians in the frame of the body (``body_gaussians``), whose axes and origin the lattice shares.
         target_nodes: approximate number of nodes.
-        dilation: initial growth, in units of the object's longest side.
-        method: the mesher.
-        solid: the solid that ``cloud`` shows, if known (``solid_from_gaussians``).
+        dilation: initial dilation, as a fraction of the object's longest side.
+        method: method that generates the tetrahedra.
+        solid: solid of ``cloud`` (``solid_from_gaussians``); None computes it.
 
     Raises:
         UserError: the object has no volume (it is flat or tiny, or nothing opaque lies above the plane).
@@ -143,14 +143,14 @@ def cage_of_body(
     _check_thickness(solid)
     weights = np.where(solid.belongs, cloud.opacities(), 0.0)
     distance = _Distance(solid)
-    # A cell has two nodes inside the solid, and the surface has about as many nodes in total as the inside.
+    # A cell has two nodes inside the solid, and there are about as many nodes on the surface as inside.
     cell = _rounded_cell((4.0 * np.count_nonzero(solid.inside) / target_nodes) ** (1.0 / 3.0))
-    # While the cage grows, large captures are evaluated on a regular sample; the final value uses all Gaussians.
+    # During the growth, a large capture is evaluated on a regular sample; the final value uses all Gaussians.
     sample = np.arange(0, cloud.count, max(1, cloud.count // _GROWTH_SAMPLE))
     best: tuple[float, float, TetMesh, CageMethod] | None = None
     for growth in range(_MAX_GROWTH_STEPS):
         grown = dilation + 0.006 * growth
-        # Growth alone does not enclose the tips of curled thin parts; a finer lattice does.
+        # Dilation alone does not enclose the tips of curled thin parts, but a finer lattice does.
         finer = round(target_nodes * (1.0 + _REFINEMENT_PER_STEP * growth))
         mesh, used, cell = _mesh(solid, distance, finer, grown, method, cell)
         enclosed = _enclosed_share(cloud, mesh, weights, sample)
@@ -177,12 +177,12 @@ def cage_of_body(
 
 
 def cage_of_mesh(cloud: GaussianCloud, mesh: TetMesh, solid: LatticeSolid) -> Cage:
-    """Return the cage that has the user's own ``mesh``.
+    """Return the cage that consists of a user's ``mesh``.
 
     Args:
-        cloud: Gaussians in their body's frame, as for ``cage_of_body``.
+        cloud: Gaussians in the frame of the body, as for ``cage_of_body``.
         mesh: tetrahedra in the same frame, above z = 0.
-        solid: the solid that ``cloud`` shows.
+        solid: solid of ``cloud``.
 
     Raises:
         UserError: the mesh encloses less than half of the object.
@@ -216,8 +216,8 @@ def _too_thin(why: str) -> UserError:
 
 
 def _thickening(cloud: GaussianCloud, solid: LatticeSolid, mesh: TetMesh) -> float:
-    """Return ``Cage.thickening``: the extents of the object are those of the means of all but 0.2 % of its opacity,
-    plus a typical standard deviation on either side."""
+    """Return ``Cage.thickening``. The extents of the object include the means of all but 0.2 % of its opacity, and a
+    typical standard deviation on either side."""
     means = cloud.means.numpy()[solid.belongs].astype(np.float64)
     low, high = mass_quantiles(means, cloud.opacities()[solid.belongs], 0.001, 0.999)
     extents, sizes = (
@@ -238,7 +238,7 @@ def _share(cloud: GaussianCloud, chosen: np.ndarray) -> float:
 
 
 def _check_thickness(solid: LatticeSolid) -> None:
-    """Raise ``UserError`` for a sheet, which is nowhere thicker than the blur of the lattice."""
+    """Raise ``UserError`` if the object is a sheet, nowhere thicker than the blur of the lattice."""
     thickest = float(_edt(np.pad(solid.inside, 1)[:, :, 1:]).max())
     size = np.ptp(np.argwhere(solid.inside), axis=0) + 1
     if thickest < 2.0 or size.min() < 4:
@@ -248,8 +248,8 @@ def _check_thickness(solid: LatticeSolid) -> None:
 def _mesh(
     solid: LatticeSolid, distance: _Distance, target_nodes: int, dilation: float, method: CageMethod, cell: float
 ) -> tuple[TetMesh, CageMethod, float]:
-    """Return the mesh, its mesher, and the lattice cell for the requested number of nodes (``cell`` if no lattice was
-    made)."""
+    """Return the mesh, its method, and the lattice cell for the requested number of nodes; ``cell`` if there was no
+    lattice."""
     if method is CageMethod.TETWILD:
         mesh = tetwild(_Field(distance, dilation, thin_radius=0.0), target_nodes)
         if mesh is not None and mesh.min_dihedral_degrees() >= _MIN_DIHEDRAL_DEGREES:
@@ -262,10 +262,10 @@ def _mesh(
 def _lattice_mesh(
     distance: _Distance, target_nodes: int, dilation: float, cell: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return nodes (lattice spacings), tetrahedra and cell of the lattice mesh with the number of nodes nearest to the
-    target.
+    """Return nodes (N, 3) in lattice spacings, tetrahedra (T, 4) and cell size of the lattice mesh whose number of
+    nodes is nearest to the target.
 
-    The cell size is found by secant steps from ``cell`` and is rounded in each step.
+    The cell size is found by the secant method, starting at ``cell``, and is rounded in each step.
     """
     best: tuple[float, np.ndarray, np.ndarray, float] | None = None
     for _ in range(6):
@@ -293,19 +293,18 @@ def _rounded_cell(cell: float) -> float:
 
 
 class _Distance:
-    """Distances to the surface of the solid and its mirror image below the plane; they do not depend on the
-    dilation."""
+    """Distances to the surface of the solid and its mirror image below the plane, without the dilation."""
 
     def __init__(self, solid: LatticeSolid) -> None:
         self.pad = int(np.ceil(0.25 * solid.longest_side / solid.spacing))
         mirrored = np.pad(np.concatenate([solid.inside[:, :, :0:-1], solid.inside], axis=2), self.pad)
         sharp = _edt(~mirrored) - _edt(mirrored)
         self.sharp = sharp - 0.5 * np.sign(sharp)
-        """Signed distance, in lattice spacings."""
+        """(nx, ny, nz) signed distance, in lattice spacings."""
         self.smooth = np.asarray(ndimage.gaussian_filter(self.sharp, 0.9))
-        """Smoothed signed distance, without the lattice's steps."""
+        """(nx, ny, nz) smoothed signed distance, without the steps of the lattice."""
         self.medial = (self.smooth < -0.2) & (self.smooth <= ndimage.minimum_filter(self.smooth, 3))
-        """Mask of the crests of the depth, which lie in the middle of thin parts (corners have none)."""
+        """(nx, ny, nz) bool, ridges of the depth, which lie in the middle of thin parts; corners have no ridges."""
         self.longest_side = solid.longest_side / solid.spacing
         """Longest side of the object, in lattice spacings."""
         self.middle = -solid.corner[:2]
@@ -316,9 +315,9 @@ class _Field:
     """Smooth signed distance of the dilated solid, in lattice spacings; negative inside."""
 
     def __init__(self, distance: _Distance, dilation: float, *, thin_radius: float) -> None:
-        """Compute the field. ``dilation`` is in units of the longest side; parts with a radius below ``thin_radius``
-        (spacings) are thickened to it."""
-        # The solid is mirrored at z = 0: the nearest crest of a point above the plane lies above it.
+        """Compute the field. ``dilation`` is a fraction of the longest side; parts with a radius below ``thin_radius``
+        (lattice spacings) are thickened to this radius."""
+        # The solid is symmetric about z = 0, so the nearest ridge of a point above the plane lies above it, too.
         above = np.s_[:, :, distance.smooth.shape[2] // 2 :]
         value = np.minimum(distance.smooth[above], distance.sharp[above] + 0.3) - dilation * distance.longest_side
         if thin_radius > 0.0:
@@ -341,17 +340,17 @@ class _Field:
         return np.append(self._middle - half, low[2]), np.append(self._middle + half, high[2])
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lattice of values from layer 0 up, and the position (3,) of its first point."""
+        """Return the values (nx, ny, nz) of the lattice from layer 0 up, and the position (3,) of its first point."""
         return self._value[:, :, 1:], np.append(-self._offset[:2], 0.0)
 
 
 def _edt(mask: np.ndarray) -> np.ndarray:
-    """Distance of each True point to the nearest False one, in lattice spacings."""
+    """Return the distance of each True point of ``mask`` to the nearest False point, in lattice spacings."""
     return np.asarray(ndimage.distance_transform_edt(mask))
 
 
 def _largest_part(nodes: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest part (by volume) connected through faces; smaller parts are dropped."""
+    """Return nodes and tetrahedra of the part with the largest volume among those that are connected through faces."""
     faces = np.sort(tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
     _, face = distinct_rows(faces)
     order = np.argsort(face, kind="stable")

@@ -14,19 +14,19 @@ from egs_warp.io.limits import MAX_COORDINATE, read_bytes
 from egs_warp.meshing.cage import MAX_NODES, MIN_NODES
 
 _FORMATS = (".mesh", ".msh", ".vtu")
-"""Name endings of the formats that are read."""
+"""Name endings of the supported formats."""
 _MAX_BYTES = 64 * 2**20
-"""Maximum size of a file; ``MAX_NODES`` nodes need some 10 MB as text."""
+"""Maximum size of a file, bytes; ``MAX_NODES`` nodes need some 10 MB as text."""
 _BELOW_GROUND = 0.01
-"""Depth below the ground, heights of the mesh, to which a node may reach; such nodes are moved to the ground."""
+"""Maximum depth of a node below the ground, in heights of the mesh; nodes below the ground are moved to it."""
 
 
 def read_cage_mesh(path: Path) -> TetMesh:
-    """Read the tetrahedra of a Medit, Gmsh or VTK (XML) file; nodes without a tetrahedron are left out.
+    """Read the tetrahedra of a Medit, Gmsh or VTK (XML) file; nodes that belong to no tetrahedron are left out.
 
     Raises:
-        UserError: the file is not such a mesh, has too few or too many nodes, several parts, or tetrahedra that are
-            flat or turned inside out.
+        UserError: the file is not such a mesh, or it has too few or too many nodes, several parts, or tetrahedra that
+            are flat or inverted.
     """
     import meshio
 
@@ -38,7 +38,7 @@ def read_cage_mesh(path: Path) -> TetMesh:
         points = np.asarray(mesh.points, np.float64)
         tets = np.concatenate([cells.data for cells in mesh.cells if cells.type == "tetra"] or [np.zeros((0, 4), int)])
         nodes, tets = _used(points, tets.astype(np.int64))
-    # meshio raises many kinds of errors, and ends the process on some.
+    # meshio raises many kinds of errors, and calls ``sys.exit`` for some.
     except (Exception, SystemExit) as error:
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise UserError(f"{path}: cannot be read as a mesh ({reason[0][:200]}); write it again") from error
@@ -63,7 +63,7 @@ def read_cage_mesh(path: Path) -> TetMesh:
 
 
 def read_cage_in(path: Path, frame: BodyFrame) -> TetMesh:
-    """Read a cage as ``read_cage_mesh``, and return it in the body's ``frame``, above z = 0.
+    """Read a cage like ``read_cage_mesh``, and return it in the body's ``frame``, above z = 0.
 
     Raises:
         UserError: as ``read_cage_mesh``, or a node lies below the ground.
@@ -83,7 +83,7 @@ def read_cage_in(path: Path, frame: BodyFrame) -> TetMesh:
 
 
 def _used(points: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points that are corners, and the tetrahedra with their indices among these.
+    """Return the points that are corners of ``tets``, and the tetrahedra with indices into these points.
 
     Raises:
         IndexError: an index is out of range.

@@ -1,4 +1,4 @@
-"""The level set of a body in its rest shape: its signed distance as a smooth function, for contact between bodies."""
+"""Level set of a body in its rest shape: its signed distance as a smooth function, for contact between bodies."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ EXPOSURE_RADIUS = 4.0
 _MARGIN = 5
 """Number of cells between the body and the boundary of the lattice."""
 _MIN_THIN_CELLS = 8
-"""Minimum number of cells of a thin part; smaller ones are the roughness of the surface."""
+"""Minimum number of cells of a thin part; smaller components are roughness of the surface."""
 _FILTER_MARGIN = 4
-"""Number of nodes outside the lattice whose values affect the coefficients of the spline."""
+"""Number of layers of nodes outside the lattice whose values affect the coefficients of the spline."""
 _SURFACE_BLUR = 0.9
 """Standard deviation in cells of the filter that removes the steps of the occupied lattice."""
 _THIN_SLACK = 0.3
-"""Maximum distance in cells by which the filter may move the surface inwards, so that thin parts remain."""
+"""Maximum distance in cells by which the filter may move the surface inwards, so that thin parts are preserved."""
 _FIT_SCALES = (4.0, 2.0, 1.5, 1.0, 1.0)
 """Standard deviations in cells of the successive corrections that move the surface to the outer points."""
 _FIT_FLOOR = 1e-3
@@ -43,14 +43,14 @@ _FIT_FLOOR = 1e-3
 
 @dataclass(frozen=True)
 class ThinParts:
-    """Parts of a body that its lattice does not resolve."""
+    """Parts of a body that are too thin for its lattice."""
 
     fraction: float
     """Fraction of the volume of the body that is thinner than two cells."""
     centres: np.ndarray
     """(n, 3) m, centre of each connected part, the largest first."""
     thickness: float
-    """Two cells, m."""
+    """Thickness below which a part is thin, m: two cells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,16 +63,16 @@ class LevelSet:
     __repr__ = short_repr
 
     origin: np.ndarray
-    """(3,) m, position of node (0, 0, 0)."""
+    """(3,) m, position of lattice node (0, 0, 0)."""
     spacing: float
-    """Distance between nodes, m."""
+    """Distance between lattice nodes, m."""
     coefficients: np.ndarray
     """(nx, ny, nz) float32, coefficients of the spline, m."""
 
     @classmethod
     def through(cls, origin: np.ndarray, spacing: float, values: np.ndarray) -> LevelSet:
         """Create the level set with ``values`` (nx, ny, nz), m, at its nodes."""
-        # The filter mirrors at the boundary, which would set the slope there to zero: continue the values linearly.
+        # Continue the values linearly: the filter's mirror condition at the boundary would set the slope there to zero.
         margin = (slice(_FILTER_MARGIN, -_FILTER_MARGIN),) * 3
         extended = np.pad(values, _FILTER_MARGIN, mode="reflect", reflect_type="odd")
         coefficients = ndimage.spline_filter(extended, order=2, output=np.float64, mode="mirror")[margin]
@@ -80,7 +80,7 @@ class LevelSet:
 
     @cached_property
     def lattice(self) -> Any:
-        """Lattice as the kernels read it (``LevelSetLattice``)."""
+        """Warp struct of the lattice for kernels (``LevelSetLattice``)."""
         lattice: Any = LevelSetLattice()
         lattice.counts = wp.vec3i(*self.coefficients.shape)
         lattice.origin = Vec3(*self.origin.tolist())
@@ -111,12 +111,11 @@ class LevelSet:
 
 
 def level_set_of_surface(vertices: np.ndarray, faces: np.ndarray, *, cells: int = MAX_CELLS) -> LevelSet:
-    """Return the level set of the closed surface with triangles ``faces`` (F, 3) of ``vertices`` (V, 3), m, wound
-    outwards.
+    """Return the level set of a closed surface.
 
     Args:
-        vertices: corners of the triangles.
-        faces: indices into ``vertices``.
+        vertices: (V, 3) m, corners of the triangles.
+        faces: (F, 3) indices into ``vertices``, wound outwards.
         cells: number of cells along the longest side, ``MIN_CELLS`` to ``MAX_CELLS``.
 
     Raises:
@@ -134,10 +133,11 @@ def level_set_of_surface(vertices: np.ndarray, faces: np.ndarray, *, cells: int 
 
 
 def level_set_of_body(solid: LatticeSolid, points: np.ndarray) -> LevelSet:
-    """Return the level set of a captured body, whose zero set passes through the outer ones of its contact points.
+    """Return the level set of a captured body whose zero set passes through the outer contact points.
 
-    The occupied lattice has the shape, but its surface is off by up to a cell. It is moved to the outer points by a
-    smooth field (multilevel approximation of scattered data), and the signed distance of the moved surface is computed.
+    The occupied lattice defines the shape, but its surface is wrong by up to a cell. A smooth field moves the surface
+    to the outer points (multilevel approximation of scattered data). The level set is the signed distance to the moved
+    surface.
 
     Args:
         solid: the solid of the capture, in metres (``solid_from_gaussians`` with a resolution of ``MIN_CELLS`` to
@@ -164,11 +164,13 @@ def level_set_of_body(solid: LatticeSolid, points: np.ndarray) -> LevelSet:
 
 
 def thin_parts(solid: LatticeSolid) -> ThinParts:
-    """Return the parts of ``solid`` (m) that are thinner than two cells, which its level set may lose."""
+    """Return the parts of ``solid`` (in metres) that are thinner than two cells and may therefore be missing in its
+    level set."""
     inside = np.pad(solid.inside, 1)
-    # Reflected at the plane, because a body does not end where it stands.
+    # Reflect the solid at the plane, because the plane is no free surface of the body.
     inside[:, :, 0] = inside[:, :, 2]
-    # Opening by a block of two cells: the filters cover a point and the next one, and the one before it and the point.
+    # Opening by a block of two cells: the minimum filter covers a point and its successor, the maximum filter a point
+    # and its predecessor.
     opened = ndimage.maximum_filter(ndimage.minimum_filter(inside, 2, origin=-1), 2)
     thin = (inside & np.logical_not(opened))[1:-1, 1:-1, 1:-1]
     labels = np.zeros(thin.shape, np.int32)
@@ -181,10 +183,11 @@ def thin_parts(solid: LatticeSolid) -> ThinParts:
 
 
 def outer_points(points: np.ndarray, radius: float) -> np.ndarray:
-    """Return (P,) bool, True for the points that are exposed to the outside: the vertices of the outer boundary of
+    """Return the mask (P,) bool of the points that are exposed to the outside: the vertices of the outer boundary of
     their alpha shape (Edelsbrunner and Muecke 1994).
 
-    A ball of ``radius`` metres that contains no point can be moved from far away until it touches them.
+    A point is exposed if a ball of this radius can be moved from infinity until it touches the point without ever
+    containing another point.
 
     Args:
         points: (P, 3) m, not all in one plane.
@@ -192,7 +195,7 @@ def outer_points(points: np.ndarray, radius: float) -> np.ndarray:
     """
     delaunay = Delaunay(points)
     neighbours, faces = delaunay.neighbors, delaunay.simplices[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]]
-    # The ball rolls from one simplex to the next through their common face, face i opposite to corner i.
+    # The ball passes from one simplex to the next through their common face; face i is opposite to corner i.
     sides = [
         np.linalg.norm(points[faces[..., i]] - points[faces[..., j]], axis=-1) for i, j in ((0, 1), (1, 2), (2, 0))
     ]
@@ -213,8 +216,8 @@ def outer_points(points: np.ndarray, radius: float) -> np.ndarray:
 def _moved_to_points(values: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Return ``values`` (nx, ny, nz) minus a smooth field such that their spline is nearly zero at ``places`` (n, 3).
 
-    All lengths are in cells. Each correction is the average of the values at the places with Gaussian weights, and
-    removes what the wider ones before it left.
+    All lengths are in cells. Each correction is the average of the spline's values at the places with Gaussian weights,
+    and reduces the residual of the wider corrections before it.
     """
     corner = np.floor(places).astype(int)
     fraction = places - corner
@@ -238,7 +241,7 @@ def _moved_to_points(values: np.ndarray, places: np.ndarray) -> np.ndarray:
 def _signed_distances(
     vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, spacing: float, counts: np.ndarray
 ) -> np.ndarray:
-    """Return (nx, ny, nz) m, distances of lattice nodes from a closed surface, negative inside."""
+    """Return the distances (nx, ny, nz) m of lattice nodes from a closed surface, negative inside."""
     device = wp.get_device("cpu")
     centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     with wp.ScopedDevice(device):

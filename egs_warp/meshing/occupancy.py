@@ -1,4 +1,4 @@
-"""The solid that a capture shows: a lattice of points over its plane, each inside or outside the object."""
+"""The solid of a capture: a lattice of points above its plane, each inside or outside the object."""
 
 from __future__ import annotations
 
@@ -13,34 +13,36 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.meshing.occupancy import OPACITY_UNIT, enclosed_kernel, splat_occupancy_kernel
 
 _OPACITY_THRESHOLD = 0.25
-"""Summed opacity above which a lattice point counts as occupied."""
+"""Sum of opacities above which a lattice point is occupied."""
 _MIN_COMPONENT_TO_BRIDGE = 0.02
-"""A detached part with more than this fraction of the opacity mass belongs to the object, and its gap is bridged."""
+"""Fraction of the opacity mass above which a detached part belongs to the object, so that the gap to it is bridged."""
 _MAX_BRIDGE = 4
 """Maximum width of a bridged gap, in lattice spacings on either side."""
 
 
 @dataclass(frozen=True)
 class LatticeSolid:
-    """The object as a set of lattice points in its body's frame. Layer 0 of the last axis lies in the plane z = 0."""
+    """The object as a set of lattice points in the frame of its body. Layer 0 of the last axis lies in the plane z =
+    0."""
 
     inside: np.ndarray
     """(nx, ny, nz) bool, one connected part."""
     corner: np.ndarray
-    """(3,) int, position of lattice point (0, 0, 0) relative to the frame's origin, which is itself a lattice point."""
+    """(3,) int, position of lattice point (0, 0, 0) relative to the frame's origin, in lattice spacings; the origin is
+    a point of the infinite lattice."""
     spacing: float
     """Distance between lattice points, in the frame's unit of length."""
     longest_side: float
     """Longest side of the object's Gaussians, in the frame's unit of length."""
     belongs: np.ndarray
-    """(n,) bool, Gaussians of the object; the others are floaters or lie below the plane."""
+    """(n,) bool, True for Gaussians of the object; the others are floaters or below the plane."""
     below_plane: np.ndarray
     """(n,) bool, Gaussians whose mean is below the plane."""
     bridged: int
-    """Lattice spacings by which gaps were bridged on either side; 0 if the object is one part."""
+    """Number of lattice spacings by which gaps were bridged on either side; 0 if the object is one part."""
 
     def points(self, lattice_points: np.ndarray) -> np.ndarray:
-        """Return the points (m, 3) of the body's frame at lattice indices (m, 3)."""
+        """Return the positions (m, 3), in the frame of the body, of ``lattice_points`` (m, 3), which are indices."""
         return self.spacing * (np.asarray(lattice_points, float) + self.corner)
 
     def scaled(self, factor: float) -> LatticeSolid:
@@ -51,9 +53,9 @@ class LatticeSolid:
 def solid_from_gaussians(cloud: GaussianCloud, *, resolution: int = 64) -> LatticeSolid:
     """Return the occupied and enclosed space above z = 0: the connected part with most of the opacity mass.
 
-    ``cloud`` is in its body's frame. ``resolution`` lattice spacings span the object's longest side. The outermost
-    lattice points determine only the integer corner and size of the lattice, not its spacing, so a body that has hardly
-    changed keeps its lattice. Raises ``UserError`` if nothing opaque stands on the plane.
+    ``cloud`` is in the frame of its body. ``resolution`` lattice spacings span the longest side of the object. The
+    bounds of the object determine only the integer corner and size of the lattice, not its spacing, so a small change
+    of the body does not move the lattice points. Raises ``UserError`` if nothing opaque stands on the plane.
     """
     means = cloud.means.numpy().astype(np.float64)
     opacities = cloud.opacities()
@@ -155,7 +157,7 @@ def _solid_within(
 
 
 def _bridge(occupied: np.ndarray, radius: int) -> np.ndarray:
-    """Morphological closing by ``radius`` spacings."""
+    """Return the morphological closing of ``occupied`` by ``radius`` lattice spacings."""
     if radius == 0:
         return occupied
     grown = np.asarray(ndimage.distance_transform_edt(~occupied)) <= radius
@@ -163,7 +165,7 @@ def _bridge(occupied: np.ndarray, radius: int) -> np.ndarray:
 
 
 def _fill(piece: np.ndarray, device: wp.Device) -> np.ndarray:
-    """Fill enclosed space. A second pass fills points that only the points filled in the first pass enclose."""
+    """Return ``piece`` with enclosed space filled. A second pass fills points that only newly filled points enclose."""
     solid = piece
     for _ in range(2):
         filled = wp.zeros(solid.shape, dtype=wp.uint8, device=device)

@@ -1,4 +1,4 @@
-"""Parts of a body that stick out of it: arms, ears, tails, heads on a neck, what a figure holds."""
+"""Protrusions of a body: arms, ears, tails, heads on a neck, objects that a figure holds."""
 
 from __future__ import annotations
 
@@ -13,42 +13,42 @@ from scipy.sparse.csgraph import dijkstra
 from egs_warp.geometry.tetmesh import TetMesh
 
 _MIN_SLENDERNESS = 0.39
-"""Smallest V / A^(3/2) of a part of volume V behind a cut of area A: a half ball has 0.38, a cylinder of two radii
-1.1."""
+"""Minimum of V / A^(3/2) for a part of volume V behind a cut of area A. It is 0.38 for a half ball, and 1.1 for a
+cylinder with a length of two radii."""
 _OPENING = 0.95
-"""The cut lies where V / A^(3/2) has its first maximum from the tip on, beyond which it falls below this fraction: the
-part opens into the body."""
+"""Fraction of a maximum of V / A^(3/2): the cut is at the first maximum from the tip after which the ratio falls below
+this fraction, because the part opens into the body there."""
 _MIN_LENGTH = 1.75
-"""Smallest length of a part, in mean edges: at less, the corners of single elements count as parts."""
+"""Minimum length of a part, in mean edge lengths; shorter parts are corners of single elements."""
 _MAX_SHARE = 0.3
-"""Largest volume of a part, as a fraction of the body's: more is the body itself."""
+"""Maximum volume of a part, as a fraction of the body's volume; a larger part is the body itself."""
 _BASE_HEIGHT = 0.06
 """Height in body heights below which a node belongs to the base; a part that reaches it supports the body."""
 _MIN_NODES = 4
-"""Nodes without which a part cannot bend."""
+"""Minimum number of nodes of a part that can bend."""
 _LATTICE = 4
-"""A tetrahedron is sampled at the centres of a lattice with this many cells along its edge."""
+"""Number of lattice cells along the edge of a tetrahedron, which is sampled at their centres."""
 
 
 @dataclass(frozen=True, eq=False)
 class Protrusion:
-    """A part that sticks out and does not stand on the ground."""
+    """A part that sticks out of the body and does not stand on the ground."""
 
     nodes: np.ndarray
-    """(k,) indices of its nodes, ascending."""
+    """(k,) indices of the nodes of the part, ascending."""
     tip: int
-    """Node farthest from the rest of the body."""
+    """Index of the node farthest from the rest of the body."""
     length: float
-    """m, along the surface of the mesh from the tip to the cut that separates it from the body."""
+    """Geodesic distance from the tip to the cut that separates the part from the body, m."""
 
 
 def find_protrusions(mesh: TetMesh, up: np.ndarray) -> tuple[Protrusion, ...]:
-    """Find the parts that stick out of a body at rest, whose lowest nodes are on the ground.
+    """Find the protrusions of a body at rest, whose lowest nodes are on the ground.
 
-    Tips are the local maxima of the mean geodesic distance to the body (Hilaga et al., "Topology matching for fully
-    automatic similarity estimation of 3D shapes", SIGGRAPH 2001). From a tip on, the body is cut at increasing
-    geodesic distances; the part ends where the volume behind the cut is largest for the area of the cut. Parts with
-    common nodes, such as those of both corners of a back rest, are joined.
+    Tips are the local maxima of the mean geodesic distance to all points of the body (Hilaga et al., "Topology matching
+    for fully automatic similarity estimation of 3D shapes", SIGGRAPH 2001). The body is cut at increasing geodesic
+    distances from each tip; the part ends where the volume behind the cut is largest relative to the area of the cut.
+    Parts with common nodes, such as the two corners of a back rest, are joined.
 
     Args:
         mesh: cage at rest, m.
@@ -79,8 +79,15 @@ def find_protrusions(mesh: TetMesh, up: np.ndarray) -> tuple[Protrusion, ...]:
 def _part_behind_cut(
     mesh: TetMesh, tip: int, distances: np.ndarray, base: np.ndarray, edge: float
 ) -> Protrusion | None:
-    """Return the part that ends at ``tip``, or None; ``distances`` (N,) m are geodesic from the tip, ``base`` (N,) are
-    the nodes on the ground, ``edge`` is the mean length of an edge, m."""
+    """Return the part that ends at ``tip``; None if there is none.
+
+    Args:
+        mesh: cage at rest, m.
+        tip: index of the node.
+        distances: (N,) m, geodesic distances from the tip.
+        base: (N,) bool, nodes on the ground.
+        edge: mean edge length, m.
+    """
     best, best_length = 0.0, 0.0
     for length, volume, area in _cuts(mesh, distances, edge):
         slenderness = volume / area**1.5
@@ -95,8 +102,11 @@ def _part_behind_cut(
 
 
 def _cuts(mesh: TetMesh, distances: np.ndarray, edge: float) -> Iterator[tuple[float, float, float]]:
-    """Yield distance (m), volume behind and area of cuts at increasing ``distances`` (N,) m; volume and area are in
-    units of the body's volume and its power 2/3, the area that of a slab one ``edge`` thick."""
+    """Yield distance (m), volume behind, and area of cuts at increasing distances from a tip.
+
+    The unit of volume is the volume V of the body, the unit of area is V^(2/3). The area of a cut is the mean over a
+    slab of thickness ``edge`` (m). ``distances`` (N,) m are those of the nodes from the tip.
+    """
     n = _LATTICE
     cells = np.array([(i, j, k) for i in range(n) for j in range(n - i) for k in range(n - i - j)])
     weights = (np.column_stack([cells, n - 1 - cells.sum(axis=1)]) + 0.25) / n

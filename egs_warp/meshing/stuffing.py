@@ -1,9 +1,9 @@
-"""Tetrahedra inside a level set: isosurface stuffing of a body-centred cubic lattice whose lowest layer is a plane.
+"""Tetrahedra inside a level set: isosurface stuffing with a body-centred cubic lattice that ends at a plane.
 
 F. Labelle and J. R. Shewchuk, "Isosurface stuffing: fast tetrahedral meshes with good dihedral angles", SIGGRAPH 2007.
-Lattice points close to the surface are moved onto it; the other tetrahedra that the surface crosses are cut. The
-lattice ends in the plane: its lowest tetrahedra are halves of lattice tetrahedra with one more point in the middle of
-each square, so the bottom is exactly flat and its outline is cut as finely as any other part of the surface.
+Lattice points close to the surface are moved onto it; tetrahedra that the surface still crosses are cut. At the plane,
+the lowest tetrahedra are halves of lattice tetrahedra, with an additional point in the middle of each square. The
+bottom is therefore exactly flat, and its outline is as fine as any other part of the surface.
 """
 
 from __future__ import annotations
@@ -15,26 +15,27 @@ import numpy as np
 from egs_warp.geometry.unique_rows import distinct_rows
 
 Field = Callable[[np.ndarray], np.ndarray]
-"""Signed distance (m,) at points (m, 3), negative inside."""
+"""Function that returns the signed distance (m,) at points (m, 3), negative inside."""
 
 _SNAP_LONG, _SNAP_SHORT = 0.25, 0.41
-"""Fraction of a long (cube side) or short (half body diagonal) edge within which a point is moved onto the surface.
-Away from the floor, dihedral angles are at least 9.26 degrees (tests/meshing/test_stuffing.py)."""
+"""Maximum distance from a lattice point to the surface at which the point is moved onto it, as a fraction of a long
+edge (side of a cube) and of a short edge (half body diagonal). Away from the floor, dihedral angles are then at least
+9.26 degrees (tests/meshing/test_stuffing.py)."""
 
 
 def isosurface_stuffing(field: Field, low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
     """Fill ``field`` < 0 above z = 0 with tetrahedra.
 
-    A solid thinner than about a cell may fall between the lattice points.
+    Parts thinner than about a cell may be missed, because they may contain no lattice point.
 
     Args:
         field: signed distance, negative inside.
         low: (3,) lower corner of a box that contains the solid.
-        high: (3,) upper corner.
+        high: (3,) upper corner of this box.
         cell: side of the lattice's cubes, in the units of the points.
 
     Returns:
-        Nodes (N, 3) and tetrahedra (T, 4) of either orientation. T is 0 if nothing is inside.
+        Nodes (N, 3) and tetrahedra (T, 4) of either orientation; T is 0 if no lattice point is inside.
     """
     points, tets, long_edges, is_floor = _lattice(low, high, cell)
     value = field(points)
@@ -58,8 +59,8 @@ _CORNER_PAIRS = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 
 
 def _lattice(low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the points (P, 3), tetrahedra (T, 4), their two long edges (T, 2) as indices into ``_CORNER_PAIRS``, and
-    the floor mask (P,)."""
+    """Return the points (P, 3) and tetrahedra (T, 4) of the lattice, the two long edges (T, 2) of each tetrahedron as
+    indices into ``_CORNER_PAIRS``, and the mask (P,) bool of points on the floor."""
     centre = 0.5 * (low + high)[:2]
     half = np.ceil(0.5 * (high - low)[:2] / cell).astype(int) + 1
     nx, ny = 2 * half
@@ -81,8 +82,8 @@ def _lattice(low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray
     )
     pieces = []
     for axis in range(3):
-        # The square between two neighbouring cells, its corners in order. Squares of the floor have the floor point
-        # below.
+        # The square between two neighbouring cells, with its corners in order. Below a square of the floor is a floor
+        # point.
         other = [k for k in range(3) if k != axis]
         count = [nx, ny, nz]
         inner = [slice(None)] * 3
@@ -127,8 +128,8 @@ def _snap(
     edge_is_long: np.ndarray,
     is_floor: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Move points near the surface to their nearest intersection. Points of the floor move along the floor or not at
-    all."""
+    """Return the points (P, 3) and values (P,) after points near the surface have been moved to the nearest
+    intersection of one of their edges with the surface. Points of the floor move only along the floor."""
     cut = np.flatnonzero(value[edges[:, 0]] * value[edges[:, 1]] < 0.0)
     ends = edges[cut]
     at = _roots(field, points[ends[:, 0]], points[ends[:, 1]], np.where(value[ends[:, 0]] < 0.0, 1, -1))
@@ -141,8 +142,8 @@ def _snap(
     travel = np.linalg.norm(target - points[end], axis=1)
     close = travel < np.concatenate([limit, limit])
     end, target, travel = end[close], target[close], travel[close]
-    # Later writes overwrite earlier ones: the nearest intersection is written last, and for floor points the ones along
-    # the floor are written after all others.
+    # Later writes overwrite earlier ones: the nearest intersection is written last. For floor points, intersections
+    # along the floor are written after all others.
     in_floor = is_floor[end] & (target[:, 2] == 0.0)
     order = np.lexsort((-travel, in_floor))
     for k in order:
@@ -169,8 +170,8 @@ def _fill_tets(
     edge_is_long: np.ndarray,
     node_of_edge: np.ndarray,
 ) -> np.ndarray:
-    """Return tetrahedra (T', 4) that fill the part of every tetrahedron inside the surface, according to its pattern of
-    signs."""
+    """Return tetrahedra (T', 4) that fill the part of each tetrahedron inside the surface, by the signs at its
+    corners."""
     order = np.argsort(-sign[tets], axis=1, kind="stable")
     tets = np.take_along_axis(tets, order, axis=1)
     signs = sign[tets]
@@ -184,8 +185,8 @@ def _fill_tets(
         return node_of_edge[edge(a, b)]
 
     def first_owns(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-        """True where the diagonal of the quad a, b, cut(b, c), cut(a, c) starts at a. Both neighbours apply the same
-        rule."""
+        """Return a mask, True where the diagonal of the quad a, b, cut(b, c), cut(a, c) starts at a. Both tetrahedra at
+        the quad apply the same rule."""
         a_long, b_long = edge_is_long[edge(a, c)], edge_is_long[edge(b, c)]
         return np.where(a_long != b_long, b_long, a < b)
 
@@ -209,7 +210,7 @@ def _fill_tets(
     shorter = np.linalg.norm(nodes[top[:, 1]] - nodes[bottom[:, 2]], axis=1) <= np.linalg.norm(
         nodes[top[:, 2]] - nodes[bottom[:, 1]], axis=1
     )
-    # The third quad lies on the surface, so its diagonal is free unless only one choice avoids a cycle.
+    # The third quad lies on the surface, so either diagonal is allowed unless it completes a cycle.
     own12 = np.where(own01 == own02, shorter, ~own01)
     out += _prisms(top, bottom, own01, own02, own12)
     a, b, c, d = pick(3, 1)
@@ -222,7 +223,7 @@ def _prisms(
     top: np.ndarray, bottom: np.ndarray, own01: np.ndarray, own02: np.ndarray, own12: np.ndarray
 ) -> list[np.ndarray]:
     """Return three tetrahedra for each prism. The diagonal of quad ij runs from top i to bottom j where ``own_ij`` is
-    set, otherwise from top j to bottom i. The three choices never form a cycle."""
+    True, otherwise from top j to bottom i. The three diagonals must not form a cycle."""
     wins = np.stack([own01.astype(int) + own02, ~own01 + own12.astype(int), (~own02).astype(int) + ~own12], axis=1)
     rank = np.argsort(-wins, axis=1, kind="stable")
     p, q = np.take_along_axis(top, rank, axis=1).T, np.take_along_axis(bottom, rank, axis=1).T

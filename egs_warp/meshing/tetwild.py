@@ -43,7 +43,7 @@ def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
     tetrahedralize = _tetrahedralize()
     edge_length = 0.05 * (600.0 / target_nodes) ** 0.5
     try:
-        # fTetWild writes a file into the working directory, and its name cannot be set.
+        # fTetWild writes a file with a fixed name into the working directory.
         with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
             nodes, tets = tetrahedralize(
                 vertices,
@@ -55,7 +55,7 @@ def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
                 num_opt_iter=40,
                 num_threads=1,
             )
-        # Within its tolerance, fTetWild moves nodes of the bottom; they are moved back into the plane.
+        # fTetWild may move nodes of the bottom within its tolerance, so move them back into the plane.
         diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
         nodes[np.abs(nodes[:, 2]) < 6e-3 * diagonal, 2] = 0.0
         return TetMesh.oriented(nodes, tets)
@@ -64,10 +64,10 @@ def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
 
 
 def _tetrahedralize() -> Callable[..., Any]:
-    """Return pytetwild's function.
+    """Import and return the meshing function of pytetwild.
 
-    pytetwild 0.4.2 imports pyvista (and with it all of VTK) for an accessor that is not used here, although its
-    metadata list pyvista as optional. An empty module replaces it during the import.
+    pytetwild 0.4.2 imports pyvista, and thereby all of VTK, for an accessor that is not used here, although its
+    metadata list pyvista as optional. An empty module replaces pyvista during the import.
     """
     try:
         import pyvista  # noqa: F401

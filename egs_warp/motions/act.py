@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 _WEIGHT = 600.0
-"""Weight of the angular velocity of a part, as large as that of balance."""
+"""Weight of the angular velocity of a part, equal to the weight of balance."""
 _RATE = 6.0
-"""Rate in sqrt(g / H) at which an error of an orientation is corrected."""
+"""Rate in sqrt(g / H) at which orientation errors are corrected."""
 _BASE_WEIGHT = 5.0
-"""Weight of the velocity of the base, which stays where it is while the body above it moves."""
+"""Weight of zero velocity of the base while the body above it moves."""
 _JOINT_SHARE, _SMALL_TURN = 0.25, 0.1
-"""Fraction of the nodes of a part, those nearest to the rest of the body, whose middle is its joint, and angle in
-radians by which a part is rotated to find its share of the rotation of the body."""
+"""Fraction of a part's nodes, nearest to the rest of the body, whose centroid is the joint of the part; and angle in
+radians of the finite difference that measures how a rotation of the part rotates the body as a whole."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,11 @@ class ActPlan:
 
 @dataclass(frozen=True)
 class ActOutcome:
-    """Measured gestures, and what the motion below them measures."""
+    """Measured gestures, and the measured quantities of the motion below them."""
 
     gestures: tuple[GestureOutcome, ...]
     below: DataclassInstance | None
-    """Quantities of the motion below, see ``BodyMotion.outcome_record``."""
+    """Measured quantities of the motion below (``BodyMotion.outcome_record``); None if it has none."""
 
     @property
     def slip(self) -> float:
@@ -62,7 +62,7 @@ class ActOutcome:
 
 
 class _Layer:
-    """Gesture that starts ``begin`` seconds after the motion."""
+    """Gesture that starts ``begin`` seconds after the motion below it."""
 
     def __init__(self, stance: Stance, gesture: Gesture, begin: float) -> None:
         self.gesture, self.begin, self.end = gesture, begin, begin + gesture.duration
@@ -81,21 +81,21 @@ class _Layer:
         self._reached = dict.fromkeys(self._extremes, 0.0)
 
     def _rest(self, part: BodyPart) -> np.ndarray:
-        """Return weights (N,) of the nodes outside ``part``, whose rotation about the up axis is the heading."""
+        """Return weights (N,) of the nodes outside ``part``; their rotation about the up axis defines the heading."""
         mass = self._body.node_mass.copy()
         if part.name != WHOLE_BODY:
             mass[part.nodes] = 0.0
         return mass / mass.sum()
 
     def _joint(self, part: BodyPart) -> np.ndarray:
-        """Return the indices of the nodes whose middle is the joint of ``part`` with the rest of the body."""
+        """Return the indices of the nodes whose centroid is the joint of ``part`` with the rest of the body."""
         middle = self._rest(part) @ self._standing
         away = np.linalg.norm(self._standing[part.nodes] - middle, axis=1)
         return part.nodes[away <= np.quantile(away, _JOINT_SHARE)]
 
     def _share_of_turn(self, index: int) -> np.ndarray:
-        """Return the matrix (3, 3) from a small rotation of a part about its joint to the best-fit rotation of the
-        whole body, ground axes."""
+        """Return the matrix (3, 3), ground axes, that maps a small rotation of a part about its joint to the best-fit
+        rotation of the whole body."""
         body, axes, turns = self._body, self._ground.axes, []
         for axis in axes:
             turned = self._rotated(index, self._standing, Rotation.from_rotvec(_SMALL_TURN * axis))
@@ -112,14 +112,14 @@ class _Layer:
         return result
 
     def turn(self, time: float) -> np.ndarray:
-        """Return the rotation vector (3,) of the body that is due to the parts ``time`` seconds after the start of the
-        gesture, radians, ground axes."""
+        """Return the rotation vector (3,) of the body, radians, ground axes, that the rotations of the parts cause
+        ``time`` seconds after the start of the gesture."""
         shares = zip(self._turned, self.gesture.channels, strict=True)
         return np.sum([share @ np.radians(channel.at(time)[0]) for share, channel in shares], axis=0)
 
     def pose(self, time: float, nodes: np.ndarray) -> np.ndarray:
-        """Return ``nodes`` (N, 3), ground coordinates, with the parts rotated as ``time`` seconds after the start of
-        the gesture."""
+        """Return ``nodes`` (N, 3), ground coordinates, with the rotations of the parts ``time`` seconds after the start
+        of the gesture."""
         for index, (part, channel) in enumerate(zip(self.gesture.parts, self.gesture.channels, strict=True)):
             if part.name != WHOLE_BODY:
                 heading = Rotation.from_rotvec([0.0, 0.0, self._headings[index]])
@@ -175,8 +175,9 @@ class _Layer:
         return found[0].at(elapsed - self.begin) if found else None
 
     def objectives(self, state: BodyState, elapsed: float, dt: float, active: Sequence[_Layer]) -> list[AnyObjective]:
-        """Return the objectives of the parts for the step of ``dt`` seconds that starts ``elapsed`` seconds after the
-        motion. The values of ``active`` gestures of one part are added, and the first of them returns its objective."""
+        """Return the objectives of the parts for a time step of ``dt`` seconds, ``elapsed`` seconds after the start of
+        the motion. The values of all ``active`` gestures of a part are added, and the first of these gestures returns
+        the objective of their sum."""
         axes, rules, body = self._ground.axes, [], self._body
         rate = _RATE * float(np.sqrt(np.linalg.norm(body.gravity) / body.height))
         for index, part in enumerate(self.gesture.parts):
@@ -215,7 +216,7 @@ class Act:
         Args:
             stance: stance at the start.
             gestures: gestures with the seconds after which each starts.
-            below: motion that moves the rest of the body; None stands.
+            below: motion of the rest of the body; None for standing.
 
         Raises:
             UserError: for a gesture of the whole body on top of a motion other than standing.
@@ -247,7 +248,7 @@ class Act:
         return max(self._end + self._time_unit, self.below.expected_time if self.below is not None else 0.0)
 
     def plan_record(self) -> DataclassInstance:
-        """Return the plan of the motion below; without one, the duration."""
+        """Return the plan of the motion below; the duration of the gestures if the body stands."""
         return ActPlan(self._end) if self.below is None else self.below.plan_record()
 
     def planned_com(self, elapsed: float) -> np.ndarray | None:
@@ -255,7 +256,7 @@ class Act:
         return None if self.below is None else self.below.planned_com(elapsed)
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> ActOutcome:
-        """Return the measured gestures, and what the motion below measures."""
+        """Return the measured gestures, and the measured quantities of the motion below."""
         below = None if self.below is None else self.below.outcome_record(trajectory, first, last)
         return ActOutcome(tuple(layer.outcome() for layer in self._layers), below)
 
@@ -264,8 +265,8 @@ class Act:
         return [] if self.below is None else self.below.notes()
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         self._started = state.time if self._started is None else self._started
         elapsed = state.time - self._started
         active = [layer for layer in self._layers if layer.begin - 0.5 * dt <= elapsed < layer.end - 0.5 * dt]

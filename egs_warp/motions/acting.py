@@ -1,4 +1,4 @@
-"""Registry of the motions that act: gestures, and jumps and walks in the manner of a character
+"""Registry of expressive motions: gestures, and jumps and walks in the manner of a character
 (docs/motions/gestures.md)."""
 
 from __future__ import annotations
@@ -23,27 +23,28 @@ from egs_warp.motions.walk import Walk
 from egs_warp.motions.walk_posture import LeggedPosture, select_posture
 
 _SNEAK_SPEED, _SNEAK_HEIGHT, _SNEAK_STEP = 0.6, 0.92, 0.1
-"""Speed of a sneak relative to that of a walk, height of its centre of mass relative to standing on a base, and length
-of its steps in body heights."""
+"""Parameters of a sneak: speed relative to a walk, height of the centre of mass of a body on a single base relative to
+standing, and step length in body heights."""
 
 
 @dataclass(frozen=True)
 class ActingKind:
-    """Motion that acts."""
+    """Kind of an expressive motion."""
 
     parameters: tuple[Value, ...]
     """Parameters, in the order in which numbers without names are read."""
     frames: Callable[[Mapping[str, float]], float]
     """Number of frames at 60 Hz within which a body of 1 m comes to rest."""
     gesture: Callable[[Stance, Mapping[str, float]], Gesture] | None = None
-    """Builds the gesture, if the motion is one, which may also run on top of another motion."""
+    """Function that builds the gesture of a motion that may run on top of another one; None for other motions."""
     begin: Callable[[Stance, Mapping[str, float]], BodyMotion] | None = None
-    """Begins a motion that is not a gesture."""
+    """Function that creates a motion that is not a gesture; None for gestures."""
     jumps: bool = False
     """True if the motion consists of jumps, which have a style."""
 
     def task(self, stance: Stance, values: Mapping[str, float]) -> BodyMotion:
-        """Return the motion of the body that stands at ``stance``; raises ``UserError`` if the body cannot do it."""
+        """Return the motion of the body that stands at ``stance``. Raises ``UserError`` if the body is not capable of
+        it."""
         if self.gesture is not None:
             return Act(stance, [(0.0, self.gesture(stance, values))])
         assert self.begin is not None
@@ -53,7 +54,7 @@ class ActingKind:
 def _sneak(stance: Stance, values: Mapping[str, float]) -> BodyMotion:
     height = stance.body.height
     route = straight_route(values["distance"] * height)
-    # Legs that a crouch has bent slide when they swing.
+    # On legs, the body does not crouch, because bent legs slide when they swing.
     crouch = 1.0 if select_posture(stance)[1] is LeggedPosture else _SNEAK_HEIGHT
     walk = Walk(stance, route, _SNEAK_STEP * height, speed=_SNEAK_SPEED, crouch=crouch)
     return Act(stance, [(0.0, watch(stance, walk.expected_time))], walk)
@@ -91,7 +92,7 @@ def _distance(default: float) -> Value:
 
 
 def _lasting(seconds: float, each: float, values: Mapping[str, float]) -> float:
-    """Return the frames of a gesture that takes ``seconds``, and ``each`` for each of its repetitions."""
+    """Return the number of frames of a gesture that takes ``seconds``, plus ``each`` seconds per repetition."""
     return 60.0 * (seconds + each * values.get("count", 0.0))
 
 
@@ -138,4 +139,4 @@ ACTING: Mapping[str, ActingKind] = {
         jumps=True,
     ),
 }
-"""Motions that act, by name."""
+"""Expressive motions by name."""

@@ -14,7 +14,7 @@ MAX_BEATS = 1000
 MAX_BEAT_TIME = 600.0
 """Largest time of a beat, s."""
 _FLIGHT_TOLERANCE = 0.5
-"""Deviation from the preferred flight time that costs as much as one second of waiting, s."""
+"""Deviation from the preferred flight time that is as costly as a delay of one second, s."""
 _MAX_DIVISION = 8
 """Largest number of parts into which the interval before a beat is divided."""
 
@@ -27,8 +27,8 @@ class Span:
     touch_down: float
     """Time of a beat, s."""
     parts: int = 1
-    """1 if the take-off is on a beat; otherwise the take-off is at the start of the last of ``parts`` equal parts of
-    the interval before the beat of the touch-down."""
+    """1 if the take-off is on a beat. Otherwise, the interval before the beat of the touch-down is divided into this
+    number of equal parts, and the take-off is at the start of the last part."""
 
     @property
     def flight(self) -> float:
@@ -73,7 +73,7 @@ def parse_beats(text: str) -> dict[str, str] | Path:
     file.
 
     Returns:
-        A dictionary from the names of a dance's parameters to the texts of their values, or the path.
+        A mapping from parameters of a dance to the texts of their values, or the path.
     """
     words = text.replace(",", " ").split()
     if not words:
@@ -93,16 +93,16 @@ def next_span(
 ) -> Span | None:
     """Return the times of the next jump, or None if no remaining beat can be reached.
 
-    The jump lands on a beat later than ``after``. It takes off on a beat or, if all earlier beats are too early, half,
-    a quarter or an eighth of the interval before the landing. The result is the candidate with the lowest cost ``wait +
-    |flight - easiest| / _FLIGHT_TOLERANCE``, where ``wait`` is the time from ``after`` to the take-off.
+    The jump lands on a beat later than ``after``. It takes off on a beat or, if all earlier beats are too early, at a
+    half, a quarter or an eighth of the last interval before the landing. The result is the candidate with the lowest
+    cost ``wait + |flight - easiest| / _FLIGHT_TOLERANCE``, where ``wait`` is the time from ``after`` to the take-off.
 
     Args:
         beats: times of the beats, increasing, s.
         after: current time, s.
-        earliest: maps a flight time to the earliest possible take-off, s.
-        flights: shortest and longest flight, s.
-        easiest: preferred flight, s.
+        earliest: function from a flight time to the earliest possible time of take-off, s.
+        flights: minimum and maximum flight time, s.
+        easiest: preferred flight time, s.
     """
     shortest, longest = flights
     best, lowest = None, math.inf

@@ -1,4 +1,4 @@
-"""Parts of a body by its shape, which key frames may name: head and branches, from the curve skeleton."""
+"""Head and branches of a body, found by its curve skeleton; key frames may refer to them by name."""
 
 from __future__ import annotations
 
@@ -12,40 +12,41 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.muscles.skeleton import Branch, Skeleton, skeleton
 
 _TOP = 0.25
-"""Depth in body heights below the highest tip within which the tip of the head lies: a raised tail may be higher."""
+"""Maximum depth of the tip of the head below the highest tip, in body heights; a raised tail may be higher."""
 _NECK = 1.15
-"""Least radius above and below a neck, relative to its own."""
+"""Minimum ratio of the radii above and below a neck to the radius of the neck."""
 _NECK_WINDOW = 3
-"""Sections over which areas are averaged, since those of single ones depend on the mesh."""
+"""Number of sections over which areas are averaged, because the area of a single section depends on the mesh."""
 _MIN_MASS, _MAX_BRANCH_MASS = 0.02, 0.3
-"""Least mass of a head above a neck, and largest mass of a branch that is a part as a whole, as fractions of the
-body's: a trunk is neither a head nor a branch."""
+"""Minimum mass of a head above a neck, and maximum mass of a branch that is a part as a whole, as fractions of the body
+mass. The second excludes the trunk."""
 _BASE_HEIGHT = 0.06
 """Height in body heights below which a node belongs to the base."""
 _MIN_NODES = 4
-"""Nodes without which a part has no inertia."""
+"""Minimum number of nodes of a part; fewer have no invertible inertia tensor."""
 
 
 @dataclass(frozen=True)
 class ShapeParts:
-    """Parts of a body by its shape, as indices of nodes."""
+    """Head and branches of a body, as node indices."""
 
     head: np.ndarray | None
-    """(k,) what is above the neck, or a small branch at the top; None if the shape shows no head."""
+    """(k,) nodes above the neck, or of a small branch at the top; None if the shape shows no head."""
     branches: tuple[np.ndarray, ...]
-    """(k,) each: arms, tails, ears, and whatever else sticks out and does not stand on the ground."""
+    """Nodes (k,) of each branch: arms, tails, ears, and other protrusions that do not stand on the ground."""
 
 
 def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> ShapeParts:
-    """Find the parts of a body at rest, whose lowest nodes are on the ground.
+    """Find the head and the branches of a body at rest, whose lowest nodes are on the ground.
 
-    The head is what lies above the highest neck of a branch of the skeleton that ends near the top, with the branches
-    that start there, or all of a small branch without a neck; of several, the one with the largest mass. A neck is a
-    section with clearly thicker ones above and below.
+    Candidates for the head are branches of the skeleton that end near the top. A candidate consists of the sections
+    above its highest neck and the branches that start there; a small branch without a neck is a candidate as a whole.
+    The head is the candidate with the largest mass. A neck is a section between clearly thicker sections above and
+    below.
 
     Args:
         mesh: cage at rest, m.
-        node_mass: (N,) kg.
+        node_mass: (N,) kg, nodal masses.
         up: (3,) unit vector away from the ground.
     """
     shape = skeleton(mesh, up)
@@ -55,7 +56,8 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
     section_from_node = shape.section_from_sample[np.asarray(KDTree(shape.samples).query(mesh.nodes)[1])]
 
     def nodes_of(sections: set[int], minimum: float, maximum: float) -> np.ndarray | None:
-        """Return the nodes of ``sections``; None if they are too few, stand on the ground or have another mass."""
+        """Return the nodes of ``sections``; None if they are too few, stand on the ground, or have a mass outside the
+        bounds."""
         nodes = np.flatnonzero(np.isin(section_from_node, list(sections)))
         share = float(node_mass[nodes].sum()) / mass
         return nodes if len(nodes) >= _MIN_NODES and minimum <= share <= maximum and not base[nodes].any() else None
@@ -83,7 +85,7 @@ def _ending_near_the_top(shape: Skeleton, depth: float) -> list[Branch]:
 
 
 def _necks(branch: Branch) -> Iterator[int]:
-    """Yield the points of the necks of a branch, from its end on."""
+    """Yield the points of the necks of a branch, starting at its end."""
     areas = np.pad(branch.radii**2, _NECK_WINDOW // 2, mode="edge")
     radii = np.sqrt(np.convolve(areas, np.full(_NECK_WINDOW, 1.0 / _NECK_WINDOW), mode="valid"))
     for k in range(len(radii) - 2, 0, -1):
@@ -93,7 +95,7 @@ def _necks(branch: Branch) -> Iterator[int]:
 
 
 def _above(shape: Skeleton, branch: Branch, neck: int) -> set[int]:
-    """Return the sections of ``branch`` after the point ``neck``, and those of the branches that start there."""
+    """Return the sections of ``branch`` after the point ``neck``, and the sections of the branches that start there."""
     sections = {section for numbers in branch.sections[neck + 1 :] for section in numbers}
     starting = [
         other

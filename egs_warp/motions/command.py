@@ -10,14 +10,14 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import read_text
 
 MAX_SPEED = 2.0
-"""Largest command, in sqrt(g H) or in radians per sqrt(H / g); larger values are rejected as typing errors."""
+"""Maximum speed of a command, in sqrt(g H) or radians per sqrt(H / g); larger values are rejected as typing errors."""
 MAX_TIME = 60.0
-"""Largest time in a file, s."""
+"""Maximum time of a command in a file, s."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """Velocity command. A body that cannot move this fast moves as fast as it can.
+    """Velocity command. A body that cannot reach the commanded speed moves as fast as it can.
 
     Raises:
         ArgumentError: for a value that is not finite or exceeds 2 in magnitude.

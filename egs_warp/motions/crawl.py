@@ -33,27 +33,27 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import REST_SPEED, RestDetector
 
 _ROUND_TIME = 3.0
-"""Duration of a round, in sqrt(H / g): the time from one stride of a section to its next."""
+"""Duration of a round, in sqrt(H / g): the time from one stride of a section to its next stride."""
 _CARRIED_FRACTION = 0.4
-"""Fraction of a round in which a section is carried; in the rest it stands."""
+"""Fraction of a round in which a section is carried; it stands for the rest of the round."""
 MAX_STRAIN = 0.12
 """Largest strain of the body in a stride."""
 _SIDE_STRIDE, _SIDE_ACCELERATION = 0.25, 0.3
-"""Largest sideways stride, or displacement of an end in a turn, in body heights, and largest sideways acceleration in
-g: at larger values, a round body would roll over."""
+"""Limits of sideways motion, beyond which a round body would roll over: stride, or displacement of an end in a turn, in
+body heights; and acceleration, in g."""
 _MAX_CURVATURE = 5.77
-"""Largest second derivative of ``smooth``, the path from 0 to 1 in a time of 1."""
+"""Maximum second derivative of ``smooth``."""
 _MAX_SLOPE = 1.875
-"""Largest slope of ``smooth``, the path from 0 to 1 in a time of 1."""
+"""Maximum slope of ``smooth``."""
 _LIFT = 0.02
 """Height to which a carried section is lifted, in body heights."""
 _ARRIVAL_TOLERANCE = 0.2
-"""Distance from the end of the route, in rounds, within which the body has arrived."""
+"""Distance from the end of the route, in strides, within which the body has arrived."""
 _ADVANCE_DISTANCE = 0.5
-"""Distance from a waypoint, in rounds, within which the body heads for the next waypoint."""
+"""Distance from a waypoint, in strides, within which the body heads for the next waypoint."""
 _MIN_PROGRESS, _MAX_FRUITLESS_ROUNDS = 0.2, 4
-"""Smallest progress in rounds that counts, and the number of consecutive rounds without it after which the crawl gives
-up."""
+"""Minimum progress of a round, in strides, and maximum number of consecutive rounds with less progress; after more, the
+crawl ends."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Crawl:
         along = _slices(self._standing[:, :2])
         length = float(np.ptp(along))
         self._behind = (along.max() - along) / length
-        """(N,) position along the body, from 0 at the front end to 1 at the back."""
+        """(N,) relative position of each node along the body, from 0 at the front to 1 at the back."""
         stride = MAX_STRAIN * length * _CARRIED_FRACTION / (_MAX_SLOPE * (1.0 - _CARRIED_FRACTION))
         aside = _SIDE_STRIDE * body.height
         self.step_limits = StepLimits(
@@ -115,7 +115,7 @@ class Crawl:
         self.planar_poses = route(self.step_limits)
         check_route(stance, self.planar_poses)
         self._next, self._from, self._to = 1, np.zeros(3), self.planar_poses[1]
-        """Index of the current goal in ``planar_poses``; planar poses of the body before and after this round."""
+        """Index of the current goal in ``planar_poses``; planar poses (3,) of the body before and after this round."""
         self._speed, self._length = speed, length
         self._round = self._duration()
         """Duration of a round, s."""
@@ -163,8 +163,8 @@ class Crawl:
         )
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         body, axes, control, unit = self.body, self.ground.axes, self.control, self.body.time_unit
         local = self.ground.local(state.positions)
         if not self._is_over and (self._round_start is None or state.time - self._round_start >= self._round - 1e-9):
@@ -198,7 +198,7 @@ class Crawl:
         self.rounds += not self._is_over
 
     def _duration(self) -> float:
-        """Return the duration of this round in seconds; it is longer where sections move sideways."""
+        """Return the duration of this round in seconds; it is longer if sections move sideways."""
         change, half = self._to - self._from, 0.5 * self._length
         aside = abs(np.cos(self._from[2]) * change[1] - np.sin(self._from[2]) * change[0]) + half * abs(change[2])
         gentle = (
@@ -238,8 +238,8 @@ class Crawl:
         return self._stride_count(self.planar_poses[-1] - planar_pose)
 
     def _planar_pose(self, local: np.ndarray) -> np.ndarray:
-        """Return the planar pose (3,) of the body with its nodes at ``local`` (N, 3). Its heading is unwrapped to the
-        value nearest to the previous one."""
+        """Return the planar pose (3,) of the body with its nodes at ``local`` (N, 3); the heading is unwrapped relative
+        to the previous one."""
         com = self.body.centre_of_mass(local)
         turn = kabsch_rotation(self.body.node_mass, self._standing - self._centre, local - com)
         heading = float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
@@ -284,8 +284,10 @@ class Crawl:
 
 
 def _slices(flat: np.ndarray) -> np.ndarray:
-    """Return the coordinate (N,) in metres of points (N, 2) on the ground along their longest axis. It increases
-    forward or, if the body lies across the forward direction, to the left."""
+    """Return the coordinate (N,) in metres of points (N, 2) on the ground along their longest axis.
+
+    It increases forward or, if the body lies across the forward direction, to the left.
+    """
     middle = flat - flat.mean(axis=0)
     axis = np.linalg.svd(middle, full_matrices=False)[2][0]
     return middle @ (axis if axis.sum() > 0.0 else -axis)

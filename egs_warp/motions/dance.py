@@ -22,7 +22,7 @@ from egs_warp.motions.turn import MAX_TURN_FRACTION, largest_turn
 from egs_warp.motions.twist import TurnHeading
 
 MIN_HEIGHT, MAX_HEIGHT = 0.1, 0.6
-"""Lowest and highest jump of a dance, in body heights."""
+"""Minimum and maximum height of the jumps of a dance, in body heights."""
 PREFERRED_HEIGHT = 0.3
 """Preferred height of a jump, in body heights."""
 HOP_LENGTH = 0.15
@@ -30,24 +30,24 @@ HOP_LENGTH = 0.15
 TWIST_ANGLE = np.radians(20.0)
 """Angle of a small twist to either side of the front, in radians."""
 BEAT_TOLERANCE = 0.04
-"""Largest error in seconds of an event that counts as on the beat."""
+"""Maximum error in seconds of an event that is considered on the beat."""
 _MIN_DISTANCE = 0.02
-"""Distance in body heights up to which a jump counts as a jump on the spot."""
+"""Maximum distance in body heights of a jump that is considered a jump on the spot."""
 _MIN_CONTACT_FORCE = 1e-6
 """Normal force, as a share of the weight, above which the body touches the ground."""
 
 
 @dataclass(frozen=True)
 class _Landing:
-    """Move of the dance: where a jump ends and how it turns."""
+    """Move of the dance: position and heading in which a jump ends."""
 
     move: str
     forward: float = 0.0
-    """Distance from the start of the dance in multiples of the distance of a small hop."""
+    """Distance from the start of the dance, in lengths of a small hop."""
     turned: float = 0.0
-    """Heading relative to the front in multiples of the angle of a small twist."""
+    """Heading relative to the front, in angles of a small twist."""
     twists: bool = False
-    """True if the jump turns; other jumps land with the heading that they started with."""
+    """True if the jump turns; other jumps keep their heading."""
 
 
 MOVES = (
@@ -70,7 +70,7 @@ class Event:
     with a contact force again."""
     move: str
     asked: float
-    """Target time: the beat, or a half, a quarter or an eighth of the interval before it."""
+    """Target time: a beat, or a time a half, a quarter or an eighth of an interval before it."""
     reached: float
     error: float
     """``reached`` - ``asked``."""
@@ -115,7 +115,7 @@ class _Step:
 
     def __post_init__(self) -> None:
         self._airborne: list[tuple[float, float]] = []
-        """Flights: the end of the last step with contact, and of the first step with contact again, s."""
+        """Flights as pairs of times, s: end of the last step with contact, and end of the next step with contact."""
         self._left: float | None = None
         self._touched = self.began
 
@@ -129,8 +129,8 @@ class _Step:
         self._left, self._touched = None, now
 
     def flight(self) -> tuple[float, float] | None:
-        """Return the times of take-off and touch-down of the longest flight, because brushing the ground is not a
-        landing; None if the body has not flown."""
+        """Return the times of take-off and touch-down; None if the body has not been in the air. They are those of the
+        longest flight, because a brief contact with the ground is not a landing."""
         return max(self._airborne, key=lambda span: span[1] - span[0], default=None)
 
     def events(self) -> list[Event]:
@@ -145,8 +145,7 @@ class _Step:
 
 
 class Dance:
-    """Stand until the next jump is due, jump to the height from which the body lands on a beat, and plan the next
-    jump."""
+    """Repeat: stand until the next jump is due, jump so high that the body lands on a beat, and plan the next jump."""
 
     def __init__(self, stance: Stance, beats: Sequence[float]) -> None:
         """Plan the first jump; ``beats`` are times in seconds from the start of the dance, increasing.
@@ -197,8 +196,8 @@ class Dance:
         return self._plan
 
     def planned_com(self, elapsed: float) -> np.ndarray:
-        """Return the planned displacement (3,) of the centre of mass in metres: that of the current jump, NaN before
-        the first."""
+        """Return the planned displacement (3,) of the centre of mass in the current jump, m; NaN before the first
+        jump."""
         for step in reversed(self._steps()):
             if elapsed >= step.began:
                 return step.start - self._steps()[0].start + step.jump.planned_com(elapsed - step.began)
@@ -234,8 +233,8 @@ class Dance:
         return notes
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         self._started = state.time if self._started is None else self._started
         now = state.time - self._started
         step = self._current_step
@@ -297,7 +296,7 @@ class Dance:
         )
 
     def _aim(self, now: float) -> Span | None:
-        """Return the next jump of a body that stands at time ``now``."""
+        """Return take-off and touch-down of the next jump of a body that stands at time ``now``; None without one."""
         return next_span(
             self._beats,
             now,
@@ -311,7 +310,7 @@ class Dance:
         return self._trial_jump.take_off_time(height) + self._lead_error
 
     def _flights(self) -> tuple[float, float]:
-        """Return the shortest and the longest flight, s."""
+        """Return the minimum and maximum flight time, s."""
         return self._flight(MIN_HEIGHT * self._start_stance.body.height), self._flight(
             MAX_HEIGHT * self._start_stance.body.height
         )
@@ -325,7 +324,7 @@ class Dance:
         return height_of_flight(flight - self._flight_error, self._start_stance.body.height, self._gravity)
 
     def _correct_timing(self, step: _Step) -> None:
-        """Correct the lead and the flight time of later jumps by half of the error of this one."""
+        """Correct the lead and the flight time of later jumps by half of the errors of this jump."""
         reached = step.flight()
         if reached is None:
             return

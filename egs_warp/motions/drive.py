@@ -28,7 +28,7 @@ from egs_warp.motions.walk import MAX_LAG, Walk
 _PLANNED_STEPS = 4
 """Number of future steps that a walk plans, assuming a constant command."""
 _MAX_SPEED_FACTOR = 1.6
-"""Largest speed of a walk, relative to the nominal speed of the gait."""
+"""Maximum speed of a walk, relative to the nominal speed of the gait."""
 
 
 def integrate_command(
@@ -73,17 +73,17 @@ class DrivenWalk(Walk):
 
     def _plan_swing(self, swing: int, local: np.ndarray) -> None:
         if self._mean_lag(local) > MAX_LAG:
-            # Continue from where slipping feet have left the body.
+            # Correct the position of the body for the slip of the feet.
             self.planar_poses[min(swing, self.gait.step_count), :2] -= self._foothold_error(local).mean(axis=0)
         self._lay_places(swing)
 
     def _lay_places(self, swing: int) -> None:
-        """Plan the planar poses from swing ``swing`` on; the pose of that index has been reached."""
+        """Plan the planar poses after index ``swing``; the pose with this index has been reached."""
         places_so_far = list(self.planar_poses[: swing + 1])
         places_so_far += [places_so_far[-1]] * (swing + 1 - len(places_so_far))
         if self.command.is_zero:
             if swing >= self.gait.step_count and swing > 0:
-                return  # The feet are already closing.
+                return  # The feet are already being brought together.
             planar_poses = places_so_far if swing > 0 else [*places_so_far, places_so_far[-1]]
         else:
             time = self._nominal_gait.swing_time + self._nominal_gait.double_time
@@ -138,7 +138,7 @@ class DrivenRoll(Roll):
         change *= min(1.0, max_change / max(float(np.linalg.norm(change)), 1e-12))
         self._velocity = self._velocity + change
         self._target = self._target + dt * self._velocity
-        # Keep the target close, so that a body that was held back does not speed up to catch up with it.
+        # Keep the target close, so that a delayed body does not accelerate to catch up with it.
         off = self._target - com[:2]
         self._target = com[:2] + off * min(1.0, 0.1 * self.body.height / max(float(np.linalg.norm(off)), 1e-12))
         return ProfileSample(self._target - self._start, self._velocity, change / dt)
@@ -152,7 +152,7 @@ class DrivePlanRecord:
     """Planned quantities of a drive."""
 
     seconds: float
-    """Time at which the last command, zero, starts, s."""
+    """Start time of the last command, which is zero, s."""
 
 
 @dataclass(frozen=True)
@@ -187,8 +187,8 @@ class LiveDrive:
         return []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         motion = self._motion
         if isinstance(motion, Stand):
             if not self.command.is_zero and motion.is_at_rest:
@@ -249,8 +249,8 @@ class ScriptedDrive:
         return DriveOutcome(float(moved[0]) / body.height, float(moved[1]) / body.height)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         self._start_time = state.time if self._start_time is None else self._start_time
         elapsed = state.time - self._start_time
         self._is_done = elapsed >= self._plan.seconds - 1e-9

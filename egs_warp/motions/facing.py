@@ -1,4 +1,4 @@
-"""Heading policies of a jump. ``motions.twist`` contains the one that turns."""
+"""Heading policies of a jump: the interface, and the policy that keeps the heading. See also ``motions.twist``."""
 
 from __future__ import annotations
 
@@ -44,12 +44,19 @@ class HeadingPolicy(Protocol):
         ...
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:
-        """Return ``pose`` (3, 3) adapted to a body with angular ``momentum`` (3,), ``left`` seconds before it lands."""
+        """Return the target pose in the air, adapted to the rotation of the body.
+
+        Args:
+            pose: (3, 3) pose to adapt.
+            momentum: (3,) kg m^2/s, angular momentum, world axes.
+            up: (3,) unit up axis.
+            left: time until the landing, s.
+        """
         ...
 
     def landed_heading(self, controller: BalanceController, positions: np.ndarray) -> float:
-        """Return the target heading of the landed body with its nodes at ``positions`` (N, 3), relative to the landing
-        frame of ``controller``."""
+        """Return the target heading in radians of the landed body with its nodes at ``positions`` (N, 3), relative to
+        the landing frame of ``controller``."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Detect from tilt and contacts that a body has fallen, and end its motion or let it get up."""
+"""Detection of falls from tilt and contacts; a fall ends the motion, or starts the attempt to get up."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from egs_warp.motions.sequence import BodyMotion, MotionSequence, MotionTask, St
 from egs_warp.motions.stance import sole_shares
 
 FALLEN_TILT = 60.0
-"""Tilt in degrees beyond which a body has fallen. A body on feet of half width w with its centre of mass h above them
-tips over beyond atan(w / h). For any body narrower than 3.5 h, that is below 60 degrees."""
+"""Tilt in degrees beyond which a body has fallen. A body with feet of half width w and its centre of mass at height h
+tips over beyond a tilt of atan(w / h), which is below 60 degrees if the feet are narrower than 3.5 h."""
 MIN_LYING_LOAD = 0.5
-"""Share of the weight above which a body lies on another part of its surface if its base carries nothing. Smaller loads
-come from brushing against a riser or a wall."""
+"""Minimum load, as a share of the weight, on another part of the surface of a body whose base is unloaded for the body
+to be lying. Smaller loads also occur in brief contacts with a riser or a wall."""
 MAX_RECOVERIES = 3
-"""Largest number of attempts to get up in one run."""
+"""Maximum number of falls in one run after which the body tries to get up."""
 FALLEN_TIME = 0.5
-"""Time in sqrt(H / g) for which a body on the ground must satisfy one of the two conditions to count as fallen. A body
-falls by H / 8 in this time; brief contacts during a landing are shorter."""
+"""Time in sqrt(H / g) for which a body on the ground must be tilted or lying to be considered fallen. In free fall, it
+descends by H / 8 in this time; brief contacts during a landing are shorter."""
 
 
 class FallMonitor:
-    """Run a sequence until its body has fallen; then return no objectives, so that the muscles relax, or get up and
+    """Run a sequence until the body falls. Then either return no objectives, so that the muscles relax, or get up and
     continue with the next motion. A ball cannot fall."""
 
     def __init__(self, sequence: MotionSequence, stance: Stance, *, gets_up: bool = False) -> None:
@@ -77,7 +77,7 @@ class FallMonitor:
         if isinstance(motion, GetUp):
             self._check_recovery(motion, elapsed)
             return
-        # A body in the air may be bouncing on its side, so the lying time is not reset.
+        # Do not reset the lying time in the air, because the body may be bouncing on its side.
         if report.forces[:, 0].sum() <= 0.0:
             return
         lies = self._lying_note(state, report) if not tips_body(self.sequence.done[-1].motion) else None

@@ -1,4 +1,4 @@
-"""Feet and legs of a body: the limbs that support it, and where they stand on the ground.
+"""Feet and legs of a body: the limbs that support it, and their soles on the ground.
 
 See docs/motions/index.md.
 """
@@ -19,22 +19,22 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs
 
 _SOLE_HEIGHT = 0.02
-"""Height in body heights above the lowest node of a foot up to which its nodes form the sole."""
+"""Height of the sole: nodes up to this height above the lowest node of a foot belong to it, in body heights."""
 _FOOT_HEIGHT = 0.1
 """Height in body heights below which a foot is not distinguished from its leg."""
 _RIGID_FRACTION = 0.15
 """Fraction of a leg, from the ground up, that moves rigidly with the foot."""
 _LYING_RATIO = 3.0
-"""Length of a base, relative to its width and to the body height, beyond which the body lies and has no feet."""
+"""Ratio of the length of a base to its width, and to the body height, beyond which the body lies and has no feet."""
 _MAX_ROUND_SOLE, _MAX_ROUND_DEVIATION = 0.6, 0.15
-"""Largest width of a ball's sole relative to the ball's width, and largest ratio of the standard deviation to the mean
-of the distance from its centre to its surface."""
+"""Conditions for a ball: maximum width of the sole relative to the width of the body, and maximum ratio of standard
+deviation to mean of the distances from its centre to its surface."""
 _SIDE_HEIGHT, _MIDDLE_FRACTION, _BLEND_FRACTION = 0.3, 0.2, 0.6
-"""Parameters of a base that is split into two feet: height in body heights up to which a side moves as a foot, fraction
-of the half width next to the middle that belongs to neither foot, and fraction of the half width over which the sides
-blend."""
+"""Parameters of a base that is split into two feet: height in body heights up to which a side moves as a foot, width of
+the middle strip that belongs to neither foot, and width over which the sides blend, both as fractions of the half
+width."""
 FIRST_FOOT_ANGLE = np.radians(15.0)
-"""Largest angle in radians to the right of straight ahead at which a foot still counts as the first."""
+"""Maximum angle to the right of straight ahead of a foot that can be the first, radians."""
 
 
 class SupportKind(Enum):
@@ -58,7 +58,7 @@ class Foot:
     leg: np.ndarray
     """(N,) weights: 1 at the foot, falling smoothly to 0 where the leg joins the body, 0 elsewhere."""
     length: float
-    """Height of the top of the leg, where it joins the body, above the ground, m."""
+    """Height above the ground of the top of the leg, where it joins the body, m."""
     height: float = 0.0
     """Height of the lowest node of the foot above the lowest node of the body, m; the leg is shorter by this height."""
     is_joined: bool = False
@@ -74,7 +74,8 @@ def find_feet(mesh: TetMesh, heights: np.ndarray, body_height: float, limbs: Lim
         mesh: cage of the body.
         heights: (N,) heights of the nodes above the ground, m.
         body_height: H, m.
-        limbs: limbs of the capture, whose gaps may be finer than those of the cage; None finds them in the cage.
+        limbs: limbs of the capture, between which gaps may be narrower than the cage resolves; None finds the limbs in
+            the cage.
     """
     limbs = limbs or find_limbs(Sections.of_mesh(mesh, heights), mesh.nodes)
     above = heights - heights.min()
@@ -143,14 +144,16 @@ def support_kind_of(mesh: TetMesh, heights: np.ndarray, foot_count: int) -> Supp
 
 
 def order_counterclockwise(positions: np.ndarray) -> np.ndarray:
-    """Return the order (feet,) of the feet at ``positions`` (feet, 2), forward and left: counterclockwise as seen from
-    above, beginning straight ahead."""
+    """Return the order (feet,) of feet, counterclockwise as seen from above and beginning straight ahead.
+
+    ``positions`` (feet, 2) are the coordinates of the feet forward and to the left.
+    """
     ahead, left = (positions - positions.mean(axis=0)).T
     return np.argsort((np.arctan2(left, ahead) + FIRST_FOOT_ANGLE) % (2.0 * np.pi))
 
 
 def split_base(positions: np.ndarray, heights: np.ndarray, sole: np.ndarray, body_height: float) -> tuple[Foot, Foot]:
-    """Split a base into its left and its right side, each without the nodes near the middle, as two feet.
+    """Split a base into two feet, its left and its right side, without the nodes near the middle.
 
     Args:
         positions: (N, 2) m, coordinates of each node forward and to the left.
@@ -174,12 +177,12 @@ def split_base(positions: np.ndarray, heights: np.ndarray, sole: np.ndarray, bod
 
 
 def foot_of_node(feet: Sequence[Foot]) -> np.ndarray:
-    """Return the index (N,) of the foot that each node belongs to; 0 if it belongs to none."""
+    """Return the index (N,) of the foot to which each node belongs; 0 for nodes of no foot."""
     return np.argmax([foot.leg for foot in feet], axis=0)
 
 
 def foot_of_contact(feet: Sequence[Foot], contacts: ContactSet) -> np.ndarray:
-    """Return the index (n,) of the foot that each contact point belongs to."""
+    """Return the index (n,) of the foot to which each contact point belongs."""
     return foot_of_node(feet)[contacts.nearest_nodes]
 
 
@@ -192,8 +195,13 @@ def foot_loads(feet: Sequence[Foot], report: StepReport | None, weight: float) -
 
 
 def _are_joined(graph: csr_matrix, limbs: Sequence[np.ndarray], above: np.ndarray) -> list[bool]:
-    """Return for each limb, given by its nodes, True if an edge connects its lower half to that of another limb;
-    ``above`` (N,) are heights above the ground."""
+    """Return, for each limb, True if an edge connects its lower half to the lower half of another limb.
+
+    Args:
+        graph: (N, N) edges of the cage.
+        limbs: nodes (k,) of each limb.
+        above: (N,) heights of the nodes above the ground.
+    """
     lower = np.full(len(above), -1)
     for limb, nodes in enumerate(limbs):
         lower[nodes[above[nodes] <= 0.5 * above[nodes].max()]] = limb

@@ -1,4 +1,4 @@
-"""Follow key frames of the user as closely as the muscles and the ground allow (docs/concepts/motions.md)."""
+"""Motion that follows key frames of the user as closely as muscles and ground allow (docs/concepts/motions.md)."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import BalanceController, RestDetector, Weights
 
 MISS_TOLERANCE = 0.1
-"""Fraction of the largest value of a channel: a key that is missed by more is reported."""
+"""Maximum error of a key, as a fraction of the largest value of its channel; larger errors are reported."""
 MAX_HOLD_TIME = 9.0
-"""Longest time in sqrt(H / g) after the last key for the body to come to rest."""
+"""Maximum time in sqrt(H / g) after the last key in which the body must come to rest."""
 USUAL_HOLD_TIME = 1.5
 """Typical time in sqrt(H / g) after the last key until the body is at rest."""
 
@@ -45,9 +45,9 @@ class FollowPlan:
 
     keys: float
     duration: float
-    """Seconds."""
+    """Time of the last key, s."""
     worst_miss: Mapping[str, float]
-    """Largest error at a key of each quantity that has one, by its name and in its unit."""
+    """Largest error at the keys of each quantity, by the name and in the unit of the quantity."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class FollowOutcome:
     """Measured result of following key frames."""
 
     worst_miss: Mapping[str, float]
-    """Largest error at a key of each quantity that has one, by its name and in its unit."""
+    """Largest error at the keys of each quantity, by the name and in the unit of the quantity."""
 
 
 class FollowPhase(Enum):
@@ -67,14 +67,14 @@ class FollowPhase(Enum):
 
 
 class Follow:
-    """Follow key frames, with objectives for a standing body in addition: balance, no spin and the shape, each unless a
-    key sets the same quantity."""
+    """Follow key frames. Objectives of a standing body (balance, zero spin, shape) apply in addition to those of the
+    keys, each unless a key sets the same quantity."""
 
     def __init__(self, stance: Stance, keys: Sequence[Key], *, weights: Weights | None = None) -> None:
         """Create the motion of the body that stands at ``stance``.
 
         Raises:
-            UserError: for a key of a part that the body does not have.
+            UserError: for a key of a part that does not exist in the body.
         """
         self.body, self.ground, self.weights = stance.body, stance.ground, weights or Weights()
         self.keys, self.channels = tuple(keys), channels(keys)
@@ -98,12 +98,12 @@ class Follow:
 
     @property
     def expected_time(self) -> float:
-        """Expected duration in seconds: that of the keys and the typical time to come to rest."""
+        """Expected duration in seconds: time of the last key plus the typical time to come to rest."""
         return self._end + USUAL_HOLD_TIME * float(np.sqrt(self.body.height / self._gravity))
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the body is at rest after the last key, or the time for that is over."""
+        """True if the body is at rest after the last key, or the time limit for that has passed."""
         return self.phase is FollowPhase.REST
 
     def plan_record(self) -> FollowPlan:
@@ -115,7 +115,7 @@ class Follow:
         return FollowPlan(float(len(self.keys)), self._end, misses)
 
     def planned_com(self, elapsed: float) -> None:
-        """Return None: keys refer to parts of the body."""
+        """Return None: key frames do not plan the path of the centre of mass."""
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> FollowOutcome:
         """Return the largest error of the keys of each quantity."""
@@ -137,16 +137,16 @@ class Follow:
         return notes
 
     def _miss(self, index: int) -> np.ndarray:
-        """Return the error (3,) at a key, measured value minus key value, in the unit of its quantity; for an
-        orientation, the rotation between the two."""
+        """Return the error (3,) at a key: measured value minus value of the key, in the unit of the quantity. For an
+        orientation, it is the rotation between both."""
         key, reached = self.keys[index], self._reached[index]
         if key.quantity is Quantity.ORIENTATION:
             return turn_between(np.array(key.value), reached)
         return reached - np.array(key.value)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of the
+        previous step."""
         if self._start_time is None:
             self._start_time = state.time
         elapsed = state.time - self._start_time
@@ -162,7 +162,7 @@ class Follow:
         ]
 
     def _advance_phase(self, state: BodyState, elapsed: float) -> None:
-        """Advance the phase: after the last key, hold still until the body is at rest or the time is over."""
+        """Advance the phase: after the last key, hold still until the body is at rest or the time limit has passed."""
         if self.phase is FollowPhase.FOLLOW and elapsed > self._end:
             self.phase = FollowPhase.HOLD
         if self.phase is not FollowPhase.HOLD:
@@ -183,7 +183,7 @@ class Follow:
         upright = self.controller.turn_towards(measurement, pose) * 0.7 * self._rate
         velocity, spin = self.controller.balance_targets(measurement, velocity, upright, dt)
         if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & ruled:
-            # A key that bends the body shifts its centre of mass, so keys have priority over its place above the feet.
+            # A key that bends the body shifts the centre of mass, so keys have priority over its position.
             weight = self.weights.landing * self.weights.com
             rules.append(centre_of_mass_velocity(self.body, self.ground.axes.T @ velocity, weight))
         if not {("body", Quantity.ORIENTATION), ("body", Quantity.ANGULAR_MOMENTUM)} & ruled:
@@ -200,7 +200,7 @@ class Follow:
         axes = Coordinates(self.ground.axes, False)
         value, rate = channel.at(elapsed + dt)
         now = self._measure(channel.part, channel.quantity, state)
-        # Rounding may put the end of a time step just after its key, so the middle of the step selects the next key.
+        # Rounding may put the end of a time step just after a key, so the middle of the step selects the next key.
         weight = channel.weight_at(elapsed + 0.5 * dt)
         weight *= self.weights.com if channel.quantity in _LINEAR else self.weights.spin
         if channel.quantity is Quantity.POSITION:
@@ -220,8 +220,8 @@ class Follow:
         return part_angular_momentum(body, part, state, momentum, weight, axes)
 
     def _measure(self, name: str, quantity: Quantity, state: BodyState) -> np.ndarray:
-        """Return the measured value (3,) of a quantity of the part ``name``, in its unit and in ground axes. A rotation
-        is unwrapped relative to the last call."""
+        """Return the measured value (3,) of a ``quantity`` of the part ``name``, in the unit of the quantity and in
+        ground axes. A rotation is unwrapped relative to the last call."""
         part, axes, height = self.parts[name], self.ground.axes, self.body.height
         if quantity is Quantity.POSITION:
             return axes @ (part.centre(state.positions) - part.centre(self._standing)) / height
@@ -243,10 +243,10 @@ _POSE_QUANTITIES = (Quantity.POSITION, Quantity.ORIENTATION)
 
 
 def parts_of_body(stance: Stance) -> list[BodyPart]:
-    """Return the parts that keys may name: the whole body, its base, its head, its feet and its branches.
+    """Return the parts to which keys may refer: the whole body, its base, its head, its feet and its branches.
 
-    A single foot is the base. Several feet, and the branches, are numbered counterclockwise as seen from above, from
-    straight ahead on. A body whose shape shows no head has its top as the head.
+    A single foot is the base. Several feet, and branches, are numbered counterclockwise as seen from above, beginning
+    straight ahead. If the shape shows no head, the top of the body is its head.
     """
     body, ground, standing = stance.body, stance.ground, stance.standing
     heights = (standing - ground.origin) @ ground.surface_normal
@@ -270,7 +270,7 @@ def _feet(stance: Stance, base: BodyPart) -> list[BodyPart]:
     if len(feet) < 2:
         return [BodyPart("foot", base.nodes, base.masses)]
     soles = [base.nodes[foot.leg[base.nodes] > 0.0] for foot in feet]
-    # A leg that is too short to reach the base stands on its own lowest nodes.
+    # The sole of a leg that does not reach down to the base consists of the leg's own lowest nodes.
     soles = [nodes if len(nodes) else foot.sole for nodes, foot in zip(soles, feet, strict=True)]
     order = order_counterclockwise(np.array([ground.local(standing[foot.sole])[:, :2].mean(axis=0) for foot in feet]))
     return [BodyPart.of(body, f"foot {number}", soles[index]) for number, index in enumerate(order, start=1)]
@@ -279,8 +279,8 @@ def _feet(stance: Stance, base: BodyPart) -> list[BodyPart]:
 def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the rotation (3,) from one orientation to another; all are rotation vectors in degrees.
 
-    Its angle is at most 360. Orientations that differ by one full turn are distinguished, those that differ by two are
-    not.
+    Its angle is at most 360. Orientations that differ by one full turn are distinguished, but orientations that differ
+    by two full turns are not.
     """
     (a, *u), (b, *v) = _quaternion(first), _quaternion(second)
     w, axis = a * b + np.dot(u, v), a * np.array(v) - b * np.array(u) - np.cross(v, u)
@@ -297,8 +297,8 @@ def _quaternion(turn: np.ndarray) -> np.ndarray:
 
 
 def _lift_near(turn: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Return ``turn``, a rotation vector (3,) of at most 180 degrees, or the same rotation the longer way round if that
-    is nearer to ``last``."""
+    """Return ``turn``, a rotation vector (3,) of at most 180 degrees, or the equivalent one about the opposite axis if
+    that is nearer to ``last``."""
     if _quaternion(turn) @ _quaternion(last) >= 0.0:
         return turn
     angle = float(np.linalg.norm(turn))

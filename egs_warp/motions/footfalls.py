@@ -1,4 +1,4 @@
-"""Footfalls and foot slip, measured from a trajectory alone."""
+"""Measurement of footfalls and foot slip from a trajectory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import Foot, foot_of_node
 
 _MIN_STANCE_LOAD = 0.05
-"""Share of the weight above which a foot supports the body; below it, the foot is being set down or lifted."""
+"""Share of the weight above which a foot supports the body; with less, the foot is being set down or lifted."""
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.support import SupportPolygon, is_line
 
 LANDED_HEIGHT = 0.005
-"""Height above the ground, in body heights, below which a foot at the end of its swing counts as landed even without
-load."""
+"""Height above the ground, in body heights, below which a foot at the end of its swing is considered landed, with or
+without load."""
 _AMBIGUOUS_FRACTION = 0.3
-"""Smallest difference between the distances of a contact point to two feet, as a fraction of the distance between the
-feet; with less, the point belongs to neither."""
+"""Minimum difference between the distances of a contact point to two feet for it to belong to the nearer one, as a
+fraction of the distance between the feet."""
 
 
 class FootholdPlanner:
@@ -35,7 +35,7 @@ class FootholdPlanner:
         """(F, 3) m, middles of the soles."""
         self._arms = [standing[foot.sole] - sole for foot, sole in zip(feet, self.soles, strict=True)]
         self.grips = self._touching(stance.ground.local(stance.contact_points)[:, :2])
-        """For each foot (k, 2) m, convex hull of its contact points relative to the middle of its sole; that of the
+        """Convex hull (k, 2) m of the contact points of each foot, relative to the middle of its sole; the hull of the
         whole sole if the foot does not touch the ground."""
 
     def _touching(self, points: np.ndarray) -> list[np.ndarray]:
@@ -66,8 +66,8 @@ class FootholdPlanner:
         return self._on_ground(index, level, float(planar_pose[2]))
 
     def landed_foothold(self, index: int, local: np.ndarray, planned: float) -> np.ndarray:
-        """Return the foothold (4,) of foot ``index`` for nodes at ``local`` (N, 3). Its heading is unwrapped to the
-        value nearest to ``planned``."""
+        """Return the foothold (4,) of foot ``index`` for nodes at ``local`` (N, 3), ground coordinates; its heading is
+        unwrapped to the value nearest to ``planned``."""
         now = local[self._feet[index].sole, :2]
         arms, rest = now - now.mean(axis=0), self._arms[index][:, :2]
         heading = float(np.arctan2((rest[:, 0] * arms[:, 1] - rest[:, 1] * arms[:, 0]).sum(), (rest * arms).sum()))
@@ -75,12 +75,12 @@ class FootholdPlanner:
         return self._on_ground(index, now.mean(axis=0), heading)
 
     def current_footholds(self, local: np.ndarray, footprints: np.ndarray) -> np.ndarray:
-        """Return ``footprints`` (F, 4) moved to the current soles of the nodes at ``local`` (N, 3)."""
+        """Return ``footprints`` (F, 4), moved to the current positions of the soles for nodes at ``local`` (N, 3)."""
         middles = np.array([local[foot.sole].mean(axis=0) for foot in self._feet])
         return np.column_stack([middles, footprints[:, 3]])
 
     def is_down(self, index: int, local: np.ndarray) -> bool:
-        """Return True if foot ``index`` is on the ground, even if it carries no load."""
+        """Return True if foot ``index`` is on the ground, with or without load, for nodes at ``local`` (N, 3)."""
         sole = local[self._feet[index].sole].mean(axis=0)
         return bool(sole[2] - self._on_ground(index, sole[:2], 0.0)[2] < LANDED_HEIGHT * self._height)
 

@@ -7,7 +7,7 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 _STEPS = 16
-"""Number of steps of the midpoint rule; accurate to 0.2 degrees for half a turn."""
+"""Number of steps of the midpoint rule, which is then accurate to 0.2 degrees for half a turn."""
 _TOLERANCE = 1e-4
 """Tolerance of the root search for the spin."""
 

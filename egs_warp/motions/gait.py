@@ -21,10 +21,10 @@ class GaitTiming:
 
 
 def feet_in_turn(count: int) -> tuple[tuple[int, ...], ...]:
-    """Return the groups of ``count`` feet, numbered round the body, that swing together.
+    """Return the groups of feet that swing together; ``count`` feet are numbered around the body.
 
-    Two and three feet swing one by one. With an even number, every other foot swings at the same time, so that four
-    feet trot diagonally. With an odd number above three, the last foot swings alone.
+    Two and three feet swing one by one. With a larger even number, every other foot swings at the same time, so that
+    four feet trot diagonally. With a larger odd number, the last foot swings alone.
     """
     if count <= 3:
         return tuple((foot,) for foot in range(count))
@@ -37,8 +37,8 @@ def feet_in_turn(count: int) -> tuple[tuple[int, ...], ...]:
 class Gait:
     """Gait of groups of feet that swing in turn.
 
-    Each swing sets a group down one step ahead of the group that swung before it; the last swings bring the feet
-    together.
+    Each swing sets a group of feet down one step ahead of the group of the previous swing; the last swings bring all
+    feet together.
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -87,8 +87,10 @@ class Gait:
         return min(swing + 1, self.step_count)
 
     def progress(self, swing: int, elapsed: float) -> float:
-        """Return the number of steps that the body should have completed ``elapsed`` seconds after ``swing`` began. The
-        progress is uniform; in the middle of a swing it equals the mean progress of the feet over the swing."""
+        """Return the number of steps that the body should have completed ``elapsed`` seconds after ``swing`` began.
+
+        The progress is uniform; in the middle of a swing, it equals the mean progress of the feet over the swing.
+        """
         done = swing + 1.0 - 0.5 * len(self.groups)
         return done + (elapsed - 0.5 * self.swing_time) / (self.swing_time + self.double_time)
 
@@ -103,8 +105,8 @@ class Gait:
         return self.window[1] * self.swing_time
 
     def foot_height(self, progress: float) -> float:
-        """Return the height in metres of a foot after a fraction ``progress`` (0 to 1) of its swing; it leaves the
-        ground and lands at rest."""
+        """Return the height in metres of a foot after a fraction ``progress`` (0 to 1) of its swing; the velocity is
+        zero at lift-off and landing."""
         return self.lift * smooth(progress / 0.4) * (1.0 - smooth((progress - 0.65) / 0.35))
 
     def transfer_progress(self, progress: float) -> float:

@@ -1,5 +1,5 @@
-"""Choose the gait of a body from its support: on feet or a flat base it walks, lying along the ground it crawls, and as
-a ball it rolls."""
+"""Selection of a gait by the support of the body: bodies on feet or a flat base walk, bodies that lie along the ground
+crawl, and balls roll."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def move_along(
         route: route to follow.
         step_length: length of the steps of a walk, m.
         speed: relative to the nominal speed.
-        step_fraction: fraction of the longest and most turned steps of a walk that its steps use.
+        step_fraction: factor on the maximum length and maximum turn of the steps of a walk, at most 1.
 
     Raises:
         UserError: if the body cannot move, or the route leads over a step in the ground.
@@ -42,8 +42,10 @@ def move_along(
 def turn_in_place(
     stance: Stance, angle: float, step_length: float, *, speed: float = 1.0, step_fraction: float = 1.0
 ) -> BodyMotion:
-    """Return the motion that turns the body by ``angle`` radians on the spot. A ball, which stands on a point, turns in
-    a jump; other bodies turn as in ``move_along``."""
+    """Return the motion that turns the body by ``angle`` radians on the spot.
+
+    A ball, which stands on a point, turns in a jump; other bodies turn by the motion of ``move_along``.
+    """
     if stance.base() is SupportKind.ROUND_BASE:
         return Turn(stance, JumpTarget(0.0, _JUMP_HEIGHT * stance.body.height), angle)
     return move_along(stance, turn_route(angle), step_length, speed=speed, step_fraction=step_fraction)

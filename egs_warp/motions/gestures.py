@@ -1,4 +1,4 @@
-"""Gestures: movements of the head, of a branch or of the whole body over the feet, as curves of target values.
+"""Gestures: curves of target values for the head, a branch, or the whole body over its feet.
 
 Times are in sqrt(H / g) from the start of the gesture. See docs/motions/gestures.md.
 """
@@ -18,23 +18,24 @@ from egs_warp.motions.keyframes import Channel, Quantity
 from egs_warp.motions.sequence import Stance
 
 WHOLE_BODY = "body"
-"""Part whose position is that of the centre of mass over the feet, and whose orientation is that of the body as a
-whole; only a standing body can move it."""
+"""Name of the part that is the whole body: its position is the position of the centre of mass over the feet. Only a
+standing body can move it."""
 TOLERANCES = {"degrees": (3.0, 0.2), "body heights": (0.01, 0.2)}
-"""Largest error of a gesture, in its unit and as a fraction of what was requested; the larger one counts."""
+"""Maximum error of a gesture by unit, the larger of two: absolute, and relative to the requested size."""
 _BOW_LEAN, _LEAN_LIMITS = 0.6, (0.2, 0.4)
-"""Lean of a bowing body relative to the angle of its head, less the head's share of the mass, and its limits: what a
-heavy head adds to the rotation of the body, the rest need not lean."""
+"""Lean of a bowing body relative to the angle of its head, minus the head's share of the mass; and its limits. The bow
+of a heavy head already rotates the body as a whole, so the rest leans less."""
 _HEAD_TILT = 250.0
 """Tilt of the head in a groove, degrees per body height of sway."""
 _WATCH_ANGLE, _WATCH_PITCH = 12.0, 1.0
-"""Rotation of the head of a sneaking body, degrees, and its part forward and down relative to that to the side."""
+"""Rotation of the head of a sneaking body to the side, degrees, and ratio of its rotation forward and down to it."""
 _MAX_HEAD_MASS = 0.6
-"""Largest mass of a head relative to that of the body."""
+"""Maximum mass of a head relative to the body mass."""
 _SAME_HEIGHT = 0.1
-"""Difference in height, in body heights, up to which two branches are equally high; of these, the right one waves."""
+"""Maximum difference in height between two branches that are considered equally high, in body heights; of these, the
+right one waves."""
 _STEEP = 0.8
-"""Upward component of the direction of a branch from which on it swings sideways instead of up."""
+"""Upward component of the unit direction of a branch above which the branch swings sideways instead of up."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,8 @@ class Gesture:
     parts: tuple[BodyPart, ...]
     """Part of each channel."""
     channels: tuple[Channel, ...]
-    """Orientations in degrees and positions in body heights; times in seconds from the start of the gesture. The first
-    channel is measured against its largest value."""
+    """Curves of orientations in degrees and positions in body heights; times are in seconds from the start of the
+    gesture. The outcome compares the first channel with its largest value."""
     quantity: str = "angle"
     """Quantity that the first channel sets, for messages."""
 
@@ -57,7 +58,7 @@ class Gesture:
 
     @property
     def moves_whole_body(self) -> bool:
-        """True if the gesture needs a body that stands."""
+        """True if the gesture moves the whole body, which must then be standing."""
         return any(part.name == WHOLE_BODY for part in self.parts)
 
 
@@ -69,7 +70,7 @@ class GestureOutcome:
     requested: float
     """Largest value of the curve."""
     reached: float
-    """Smallest of the largest values that were measured around the keys with the value ``requested``."""
+    """Measured size: the minimum, over all keys with the value ``requested``, of the maximum around a key."""
     quantity: str
     """Quantity of ``requested`` and ``reached``, such as ``angle``."""
     unit: str
@@ -119,7 +120,7 @@ class _Builder:
         )
 
     def turn(self, part: BodyPart, axis: Sequence[float], times: Sequence[float], degrees: Sequence[float]) -> None:
-        """Add a channel that rotates ``part`` about ``axis`` (3,), forward, left and up, by ``degrees``."""
+        """Add a channel that rotates ``part`` about ``axis`` (3,) (forward, left, up) by ``degrees`` at ``times``."""
         self.add(part, Quantity.ORIENTATION, times, [tuple(value * x for x in axis) for value in degrees])
 
     def beats(self, seconds: float) -> float:
@@ -131,7 +132,7 @@ class _Builder:
         return Gesture(self.name, tuple(self._parts), tuple(self._channels), quantity)
 
     def head(self) -> BodyPart:
-        """Return the head, or the top of a body of which the part above the neck is most.
+        """Return the head; the top of the body if the head is most of its mass.
 
         Raises:
             UserError: for a body that lies along the ground or rolls.
@@ -143,7 +144,7 @@ class _Builder:
         return head if is_head else BodyPart.head(body, local[:, 2])
 
     def check_upright(self, missing: str) -> None:
-        """Raise ``UserError`` for a body without an upright pose; ``missing`` says what it does not have."""
+        """Raise ``UserError`` for a body without an upright pose; ``missing`` names the missing part in the message."""
         kind = self.stance.base()
         if kind in (SupportKind.LYING, SupportKind.ROUND_BASE):
             raise UserError(f"{self.name}: the body stands on {kind.value} and has {missing}; walk or jump")
@@ -174,7 +175,7 @@ def shake(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 
 def look_around(stance: Stance, values: Mapping[str, float]) -> Gesture:
-    """Return a look to the left and to the right: each turn dips in the middle and is held at its end."""
+    """Return a look to the left and to the right: the head dips in the middle of each turn, and is held at its end."""
     built, size = _Builder("look around", stance), values["degrees"]
     head = built.head()
     left, right = np.array([0.0, -0.15, 1.0]) * size, np.array([0.0, -0.15, -1.0]) * size
@@ -186,7 +187,7 @@ def look_around(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 
 def bow(stance: Stance, values: Mapping[str, float]) -> Gesture:
-    """Return a bow: the head leads, the body leans after it, and both come up in the opposite order."""
+    """Return a bow: the head leads, the body follows, and both rise in the opposite order."""
     built, size = _Builder("bow", stance), values["degrees"]
     head = built.head()
     built.turn(head, (0.0, 1.0, 0.0), [0.5, 2.4, 4.6, 7.4], [-0.1 * size, size, size, 0.0])
@@ -199,7 +200,7 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     """Return a wave: a branch is raised and swings ``count`` times.
 
     Raises:
-        UserError: for a body without a branch, or without that of the given number.
+        UserError: for a body without a branch, or without a branch of the given number.
     """
     built, count, size = _Builder("wave", stance), int(values["count"]), values["degrees"]
     branches = [part for part in parts_of_body(stance) if part.name.startswith("branch ")]
@@ -222,8 +223,10 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 
 def groove(stance: Stance, values: Mapping[str, float]) -> Gesture:
-    """Return a dance on the spot that ends as it begins: the body sways from side to side on the beats and dips between
-    them, and the head tilts against it."""
+    """Return a dance on the spot that ends in its initial pose.
+
+    The body sways from side to side on the beats and dips between them, and the head tilts in the opposite direction.
+    """
     built, count, sway = _Builder("groove", stance), int(values["beats"]), values["sway"]
     built.check_upright("no feet to sway over")
     beat = built.beats(60.0 / values["tempo"])
@@ -242,7 +245,7 @@ def groove(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 
 def watch(stance: Stance, seconds: float) -> Gesture:
-    """Return the looks to both sides of a body that sneaks for ``seconds``, its head held low."""
+    """Return the gesture of a body that sneaks for ``seconds``: it looks to both sides, its head held low."""
     built = _Builder("watch", stance)
     length = built.beats(seconds)
     low, left, right = (np.array([0.0, _WATCH_PITCH, side]) for side in (0.0, 1.0, -1.0))
@@ -256,8 +259,8 @@ def watch(stance: Stance, seconds: float) -> Gesture:
 
 
 def landed_pose(stance: Stance, depth: float, seconds: float) -> Gesture:
-    """Return a pose that holds a crouch by ``depth`` (m), in which the body has landed, for ``seconds``: the head rises
-    and looks ahead, and the body stands up."""
+    """Return the gesture after a landing in a crouch of ``depth`` metres: the body holds the crouch for ``seconds``,
+    raises its head, and then stands up."""
     built = _Builder("pose", stance)
     low = (0.0, 0.0, -depth / stance.body.height)
     hold = max(built.beats(seconds), 1.0)

@@ -1,4 +1,4 @@
-"""Get up: a lying body pushes itself up about the edge of its base, rolls over it, and straightens from a crouch.
+"""Get up: a lying body pushes itself up, rolls over an edge of its base, and straightens from a crouch.
 
 See docs/concepts/motions.md.
 """
@@ -46,22 +46,22 @@ _MAX_BRAKING = 4.0
 _BASE_HEIGHT = 0.3
 """Height in body heights above the sole of the standing body up to which nodes belong to the base."""
 _EDGE_ANGLE = 35.0
-"""Angle in degrees that determines the edge over which the body rolls: its nodes would touch first if the ground were
-steeper by this angle, or by half of the tilt of the base if that is less."""
+"""Angle in degrees that determines the edge over which the body rolls: the nodes of the edge would touch first if the
+ground were steeper by this angle, or by half of the tilt of the base if that is smaller."""
 _LANDED_ANGLE = 20.0
-"""Largest tilt in degrees of a base that has landed."""
+"""Maximum tilt in degrees of a base that is considered landed."""
 _CROUCH_FRACTION = 0.75
-"""Fraction of the standing height of the centre of mass at which the body is held until it is at rest. A low centre of
-mass must rise further before the body tips over the other side of its base."""
+"""Target height of the centre of mass until the body is at rest, as a fraction of its standing height. A low centre of
+mass makes the body less likely to tip over the other side of its base."""
 _MIN_PUSH_DISTANCE = 0.1
 """Distance behind the edge, in body heights, beyond which contact points can push."""
 _MAX_LIE_TIME, _MAX_ROLL_TIME, _MAX_STRAIGHTEN_TIME = 6.0, 6.0, 10.0
-"""Longest times in sqrt(H / g) to wait for rest while lying, to roll, and to come to rest on the feet."""
+"""Maximum times in sqrt(H / g) for coming to rest while lying, for rolling, and for coming to rest on the feet."""
 _FAIL_TIME, _FAIL_RATE = 0.6, 0.05
-"""Time in sqrt(H / g) after which an attempt fails if the body rolls back, and the rate in radians per sqrt(H / g)
-above which it counts as rolling back."""
+"""Time in sqrt(H / g) after which an attempt fails if the body rolls back, and minimum rate of rolling back in radians
+per sqrt(H / g)."""
 _MAX_BASE_TILT = 60.0
-"""Tilt of the base in degrees beyond which the body does not stand."""
+"""Maximum tilt of the base of a standing body, degrees."""
 
 
 class GetUpPhase(Enum):
@@ -98,7 +98,7 @@ class GetUpControl:
     pose: float = 0.05
     """Weight of the standing shape while the body pushes."""
     carried: float = 0.3
-    """Weight of the current shape once the body rolls on without pushing."""
+    """Weight of the current shape while the body rolls without pushing."""
     follow: float = 8.0
     """Rate in sqrt(g / H) at which the shape is approached."""
 
@@ -108,7 +108,7 @@ class _Roll:
     """State of the roll about the edge of the base; world axes."""
 
     axis: np.ndarray
-    """(3,) unit, horizontal axis about which the body rotates upright."""
+    """(3,) horizontal unit vector, axis of the rotation to upright."""
     arm: np.ndarray
     """(3,) m, from the edge to the centre of mass, orthogonal to ``axis``."""
     inertia: float
@@ -116,13 +116,13 @@ class _Roll:
     rate: float
     """rad/s, angular velocity about the edge."""
     missing: float
-    """Height in metres by which the centre of mass has to rise to pass the top."""
+    """Height in metres by which the centre of mass still has to rise to pass the top of the roll."""
     pushes: bool
     """True if the ground supports the body behind the edge."""
 
 
 class GetUp:
-    """Push the body up and stand, or give up after the attempts of ``_ATTEMPTS``."""
+    """Push the body up and stand; give up if all ``_ATTEMPTS`` fail."""
 
     def __init__(self, stance: Stance, *, control: GetUpControl | None = None) -> None:
         """Create the motion.
@@ -171,7 +171,7 @@ class GetUp:
         return 8.0 * self._unit
 
     def plan_record(self) -> GetUpPlan:
-        """Return the largest number of attempts."""
+        """Return the maximum number of attempts."""
         return GetUpPlan(float(len(_ATTEMPTS)))
 
     def planned_com(self, elapsed: float) -> None:
@@ -190,8 +190,8 @@ class GetUp:
         return GetUpOutcome(float(self.tries))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         roll = self._measure(state, report)
         self._advance(state, report, roll)
         if self.phase in (GetUpPhase.CATCH, GetUpPhase.STAND):
@@ -262,8 +262,8 @@ class GetUp:
         self._enter(phase, state.time)
 
     def _tilt(self, positions: np.ndarray, nodes: np.ndarray | slice = slice(None)) -> tuple[float, np.ndarray]:
-        """Return the tilt from upright in radians of the body, or of some of its ``nodes``, and the horizontal axis
-        (3,), world axes, about which a rotation undoes it."""
+        """Return the tilt from upright of the body, or of some of its ``nodes``, in radians, and the horizontal axis
+        (3,), world axes, about which a rotation by the tilt makes it upright."""
         mass, arms, up = self.body.node_mass[nodes], self._arms[nodes], self.ground.axes[2]
         now = positions[nodes]
         turn = kabsch_rotation(mass, arms - mass @ arms / mass.sum(), now - mass @ now / mass.sum())
@@ -274,15 +274,16 @@ class GetUp:
         return angle, axis / size if size > 1e-9 else self.ground.axes[0]
 
     def _top(self, arms: np.ndarray, axis: np.ndarray, angle: float) -> float:
-        """Return the largest height in metres of the centre of mass above the ground while a body with ``arms`` (N, 3)
-        rolls about ``axis`` (3,) by ``angle`` radians, over whichever edges it meets."""
+        """Return the maximum height in metres of the centre of mass above the ground while a body rolls about ``axis``
+        (3,) by ``angle`` radians, over all edges on its path; ``arms`` (N, 3) are the nodes relative to the centre of
+        mass."""
         normal = self.ground.surface_normal
         turns = Rotation.from_rotvec(np.linspace(0.0, angle, max(int(np.degrees(angle) / 3.0), 2))[:, None] * axis)
         return float((-(turns.inv().apply(normal) @ arms.T).min(axis=1)).max())
 
     def _roll_objectives(self, state: BodyState, roll: _Roll, dt: float) -> list[AnyObjective]:
-        """Return objectives for the centre of mass and the spin of a body that rolls about its edge as a whole, at the
-        rate that takes it over the top. Once no contact pushes it, the rate is that of the free roll."""
+        """Return objectives for the centre of mass and the spin of a body that rolls rigidly about its edge, at the
+        rate that takes it over the top. When no contact can push it, the target is the rate of the free roll."""
         body, control, unit = self.body, self.control, self._unit
         weight = body.mass * self._gravity
         elapsed = state.time - self._entered + dt

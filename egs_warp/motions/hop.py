@@ -1,4 +1,4 @@
-"""Hops: a row of jumps, each to its own target on the ground, planned from the landing of the previous one.
+"""Hops: a row of jumps to targets on the ground; each jump is planned from the landing of the previous one.
 
 See docs/concepts/motions.md.
 """
@@ -36,7 +36,7 @@ class Hop:
 
         Args:
             stance: stance at the start.
-            square: (3,) m, target of the middle of the feet.
+            square: (3,) m, target position of the middle of the feet.
             height: rise of the centre of mass, m.
         """
         offset = square - sole_shares(stance.body, stance.ground, stance.standing) @ stance.standing
@@ -84,8 +84,7 @@ class Hop:
 
 
 class HopTargets:
-    """Row of targets ahead of the stance in which the first hop begins, so that errors of the hops do not
-    accumulate."""
+    """Row of targets relative to the stance of the first hop, so that errors of the hops do not accumulate."""
 
     def __init__(self, distance: float, height: float, count: int, values: Mapping[str, float]) -> None:
         """Create the targets.

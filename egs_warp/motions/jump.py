@@ -1,7 +1,7 @@
-"""A jump to a target: a closed-loop state machine that computes objectives from the measured state
+"""Jump to a target: a closed-loop state machine that computes objectives from the measured state
 (docs/concepts/motions.md).
 
-From take-off on, quantities are relative to the frame of the landing, which may be rotated, higher or lower.
+After take-off, quantities are relative to the frame of the landing, which may be rotated, higher or lower.
 """
 
 from __future__ import annotations
@@ -33,52 +33,51 @@ from egs_warp.motions.support import nearest_in_half_planes
 from egs_warp.motions.walk_posture import LeggedPosture, select_posture
 
 STOP_RISE_FRACTION = 0.94
-"""A thrust ends when the centre of mass would reach this fraction of the requested height in free flight: one more time
-step would exceed it."""
+"""Fraction of the requested height: a thrust ends when the centre of mass would reach it in free flight. One more time
+step would exceed the requested height."""
 AIM_RISE_FRACTION = 0.99
-"""Fraction of the requested height at which a thrust aims. It exceeds ``STOP_RISE_FRACTION``, so that a thrust whose
-speed falls slightly short of its target also ends."""
+"""Target of a thrust, as a fraction of the requested height. It exceeds ``STOP_RISE_FRACTION``, so that the thrust also
+ends if its speed falls slightly short of the target."""
 FORWARD_TIME_FRACTION = 0.7
 """Fraction of the time of a thrust in which the forward speed is reached."""
 MAX_FOOTHOLD_OFFSET = 0.4
-"""Fraction of the footprint by which the foothold may differ from the capture point to be nearer to the target."""
+"""Maximum offset of the foothold from the capture point towards the target, as a fraction of the footprint."""
 NARROW_SUPPORT, WIDE_SUPPORT = np.tan(np.radians([8.0, 17.0]))
 """Distances to the edge of the footprint, relative to the height of the centre of mass: up to the first, the foothold
 must equal the capture point; from the second on, it may differ by ``MAX_FOOTHOLD_OFFSET``."""
 STEP_CLEARANCE = 0.15
 """Clearance of the feet above a step, as a fraction of its height, before they swing forward."""
 APPROACH_RATE = 2.5
-"""Rate at which the pose of the landing is approached, multiplied by the remaining time in the air, so that the
-approach is slow at first."""
+"""Product of the rate at which the pose of the landing is approached and the remaining time in the air. The approach is
+therefore slow at first."""
 TOUCH_DOWN_HEIGHT = 0.06
-"""Height of the centre of mass above its standing height, in body heights, below which the first contact counts as the
-landing."""
+"""Height of the centre of mass above its standing height, in body heights, below which the first contact is considered
+the landing."""
 MAX_LANDING_TIME = 9.0
-"""Longest landing in sqrt(H / g); after it, the body counts as at rest."""
+"""Maximum duration of a landing in sqrt(H / g), after which the body is considered at rest."""
 LANDING_RAMP_TIME = 0.5
-"""Time in sqrt(H / g) from touch-down until balance and upright objectives have their full weight."""
+"""Time in sqrt(H / g) from touch-down until the objectives of balance and upright posture have their full weight."""
 LANDING_LEAN_FRACTION = 0.7
-"""Fraction of the lean of the landing that the target rotation at touch-down omits. A body that leaned as far as its
-feet are ahead would land on its heels and be thrown over them."""
+"""Fraction of the lean at landing that the target rotation at touch-down omits. With the full lean, the body would land
+on its heels and topple over them."""
 FLAT_SOLE_SPEED = 0.1
-"""Speed in sqrt(g H) towards the feet from which on the soles must be flat; at lower speeds, they are flattened in
-part."""
+"""Speed towards the feet, in sqrt(g H), above which the soles must be flat; at lower speeds, they are flattened
+partially."""
 POSE_BLEND_TIME = 0.3
-"""Time in sqrt(H / g) in which the pose of a phase replaces that of the previous one."""
+"""Time in sqrt(H / g) for the transition from the pose of one phase to the pose of the next."""
 TAKE_OFF_RELEASE_TIME = 0.6
 """Time in sqrt(H / g) after take-off in which the pose of the landing is adopted."""
 URGENT_CAPTURE_MARGIN = 0.5
-"""Fraction of the distance from the middle of the feet to their edge; a landing body whose capture point is farther out
-is balanced with more than the usual weights."""
+"""Distance of the capture point from the middle of the feet, as a fraction of the distance to their edge. Beyond it, a
+landing body is balanced with increased weights."""
 SWING_WEIGHT, BASE_SWING_WEIGHT = 5.0, 1.0
-"""Weights of the soles in the air, for feet on legs and for a base: the soles swing forward under a body that keeps its
-shape. Controlled by the pose alone, they land 0.03 body heights short, and a body with little support in front falls
-over them. A base is stiff: with a weight of 5, a monkey's jump takes 50 % more work and lands no better."""
+"""Weights of the velocities of the soles in the air, for feet on legs and for a single base. Without these objectives,
+the soles land 0.03 body heights short, and a body with little support in front falls over them. A base is stiff: with a
+weight of 5, a monkey's jump takes 50 % more work and does not land better."""
 AIRBORNE_POSE_WEIGHT, BASE_AIRBORNE_POSE_WEIGHT = 2.0, 0.3
-"""Weights of the pose in the air, where nothing else can be steered and the feet have to reach their target. The first
-is for bodies on legs and for bodies that turn in the air, whose rotation depends on their width; the second is for a
-base without a turn. With a weight of 2, the muscles of a pawn do 0.76 m g H of work in the air; with 0.3, they do 0.30
-m g H, and the pawn lands equally well."""
+"""Weights of the pose in the air. The first is for bodies on legs, and for bodies that turn in the air, whose rotation
+depends on their width. The second is for a single base without a turn: with a weight of 2, the muscles of a pawn do
+0.76 m g H of work in the air; with 0.3, they do 0.30 m g H, and the pawn lands equally well."""
 
 
 class Jump:
@@ -129,7 +128,7 @@ class Jump:
             BodyPart.of(body, "sole", sole) for sole in ([foot.sole for foot in feet] if on_legs else [base])
         ]
         self._time_unit = float(np.sqrt(body.height / self.gravity))
-        # Feet on legs stay where they touch down while the fall is stopped.
+        # Feet on legs do not move after touch-down while the fall is stopped.
         self._landing_time = LANDING_TIME * self._time_unit if on_legs else 0.0
         self._support_ahead = self.controller.footprint.extent(np.array([1.0, 0.0]))
         self._style, self._step, self._max_lean = stance.style, stance.step, MAX_LEAN * self._support_ahead
@@ -149,12 +148,12 @@ class Jump:
 
     @property
     def ground(self) -> GroundFrame:
-        """Reference frame of the motion: that of the start, from take-off on that of the landing."""
+        """Reference frame of the motion: the frame of the start until take-off, the frame of the landing afterwards."""
         return self.controller.ground
 
     @property
     def is_airborne(self) -> bool:
-        """True if the reference frame is that of the landing."""
+        """True if the reference frame is the frame of the landing."""
         return self.controller is self._landing
 
     @property
@@ -177,8 +176,8 @@ class Jump:
         )
 
     def take_off_time(self, height: float) -> float:
-        """Return the planned seconds from the start of the crouch to the end of the thrust for a jump on the spot,
-        ``height`` metres high. Crouch and thrust take whole time steps."""
+        """Return the planned time in seconds from the start of the crouch to the end of the thrust, for a jump on the
+        spot, ``height`` metres high. Crouch and thrust take whole numbers of time steps."""
         return self._plan_for(JumpTarget(0.0, height)).take_off_time(self._step)
 
     @property
@@ -209,8 +208,8 @@ class Jump:
         return [f"{phase.value} took too long: {named[phase]}" for phase in self._overran]
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         measurement = self.controller.measure(state, report)
         self.facing.update(measurement.heading + (self.facing.target_heading if self.is_airborne else 0.0))
         self._advance_phase(measurement, state.time, dt)
@@ -245,7 +244,7 @@ class Jump:
             self.phase = list(JumpPhase)[list(JumpPhase).index(self.phase) + 1]
             self._entered, self._pose_before = time, self._last_pose
         if self.phase is JumpPhase.FLIGHT and not self.is_airborne:
-            # Poses are relative to the standing pose of the frame, which is rotated in the frame of the landing.
+            # Poses are relative to the standing pose, which is rotated in the frame of the landing.
             rotation = self.ground.rotation_about_up(self.facing.target_heading)
             self._last_pose, self._pose_before = self._last_pose @ rotation.T, self._pose_before @ rotation.T
             self.controller = self._landing
@@ -257,13 +256,12 @@ class Jump:
         speed = max(measurement.velocity[2] - 0.5 * self.gravity * dt, 0.0)
         apex = measurement.com[2] + speed**2 / (2.0 * self.gravity)
         enough = bool(apex >= self._start_com[2] + STOP_RISE_FRACTION * self.target.height)
-        # A body in the air has finished its thrust, whatever its speed; waiting for the target speed would lose the
-        # time to steer the feet.
+        # The thrust of a body in the air has ended, whatever its speed: the feet must be steered from then on.
         return enough or not (measurement.in_contact or measurement.sole_height <= 0.0)
 
     def _has_landed(self, measurement: Measurement) -> bool:
-        """Return True if the body stands on the ground again. If it is still high, a contact counts only if it carries
-        more than the weight."""
+        """Return True if the body stands on the ground again. While it is still high, only contacts that carry more
+        than the weight are considered a landing."""
         low = measurement.com[2] < self._start_com[2] + TOUCH_DOWN_HEIGHT * self.body.height
         return measurement.in_contact and measurement.velocity[2] < 0.0 and (low or measurement.normal_load > 1.0)
 
@@ -276,10 +274,10 @@ class Jump:
         return self._body_objectives(state, measurement, velocity, pose, spin, dt)
 
     def _thrust(self, state: BodyState, measurement: Measurement, elapsed: float, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the thrust. Along the ground, the target speed takes the centre of mass from its
-        measured position to its position at touch-down."""
+        """Return the objectives of the thrust. The target speed along the ground takes the centre of mass from its
+        measured position to its target position at touch-down."""
         plan, (position, velocity) = self.plan, self.plan.thrust(self._start_com, elapsed)
-        # Limit the upward speed to the one that free flight to the requested height needs.
+        # Limit the upward speed to that which free flight to the requested height requires.
         up = min(self._following(measurement, position, velocity, dt)[2], self._sufficient_speed(measurement, dt))
         left = max((plan.speed_up - measurement.velocity[2]) / plan.speed_up * plan.thrust_time, dt)
         landing = self._landing_com(position)
@@ -313,8 +311,9 @@ class Jump:
     ) -> np.ndarray:
         """Return the target spin (3,) in rad/s, ``left`` seconds before take-off.
 
-        It blends from the spin that keeps the body in the pose ``standing`` (3, 3) to the one that takes it to the pose
-        ``landing`` (3, 3). The spin about the up axis grows with the speed, because friction grows with the load.
+        It changes gradually from the spin that keeps the body in the pose ``standing`` (3, 3) to the spin that takes it
+        to the pose ``landing`` (3, 3). The spin about the up axis grows with the speed, because friction grows with the
+        load.
         """
         up, inertia = self.ground.axes[2], measurement.inertia
         upright = self.controller.turn_towards(measurement, landing)
@@ -333,12 +332,12 @@ class Jump:
         touch_down, left = self._touch_down(measurement, dt)
         heading = self.facing.heading - self.facing.target_heading
         pose = self.controller.over_base(touch_down, self._foothold(state, measurement, touch_down, left), heading)
-        # The target is the current spin: no force rotates a body in the air, and a foot that is still on the ground
-        # must not push.
+        # The target is the current spin, because no torque acts on a body in the air, and a foot that is still on the
+        # ground must not push.
         spin = np.linalg.solve(measurement.inertia, measurement.angular_momentum)
         pose = self.facing.airborne_pose(pose, measurement.angular_momentum, self.ground.axes[2], left)
         velocity = measurement.velocity - np.array([0.0, 0.0, self.gravity * dt])
-        # The weights ramp up, so that the strain of the thrust is released first.
+        # Increase the weights gradually, so that the strain of the thrust is released first.
         share = self._ramp_or_full(state.time + dt, TAKE_OFF_RELEASE_TIME)
         objectives = self._body_objectives(state, measurement, velocity, pose, spin, dt, left=left, share=share)
         return [*objectives, *self._swing_objectives(state, pose, left, share)]
@@ -364,13 +363,13 @@ class Jump:
         acceleration[:2] = self.controller.capture_acceleration(measurement, goal[:2])
         velocity = measurement.velocity + dt * acceleration
         heading = self.facing.landed_heading(self.controller, state.positions)
-        # The pose is upright wherever the centre of mass is now: a pose that leaned with it would not bring it back.
+        # The pose is upright for every position of the centre of mass: a pose that leans with it would not return it.
         pose = self.controller.over_base(
             np.array([*goal[:2], measurement.com[2] + dt * velocity[2]]), measurement.foot_centre, heading
         )
-        # While the body still moves towards its feet, it is rotated until the soles are flat, because a body on its
-        # heels cannot brake. If its mean rotation were upright while it is sheared backward, its sole would be tilted
-        # up by half of the shear.
+        # While the body still moves towards its feet, rotate it until the soles are flat, because a body on its heels
+        # cannot brake. If its mean rotation were upright while it is sheared backward, the sole would be tilted up by
+        # half of the shear.
         ahead = goal[:2] - measurement.com[:2]
         closing = float(ahead @ measurement.velocity[:2]) / max(float(np.linalg.norm(ahead)), 1e-9 * self.body.height)
         approach = min(max(closing / (FLAT_SOLE_SPEED * self.body.speed_unit), 0.0), 1.0)
@@ -379,18 +378,18 @@ class Jump:
         )
         upright = self._ramp(state.time + dt, LANDING_RAMP_TIME) * self._upright(measurement, flat)
         velocity, spin = self.controller.balance_targets(measurement, velocity, upright, dt)
-        # The ground stops the fall; afterwards low weights suffice for a body that comes to rest by itself.
+        # After the ground has stopped the fall, low weights suffice for a body that comes to rest by itself.
         urgent = (self.controller.capture_margin(measurement) - URGENT_CAPTURE_MARGIN) / (1.0 - URGENT_CAPTURE_MARGIN)
         share = self._ramp_or_full(state.time + dt, LANDING_RAMP_TIME) * max(self.weights.landing, min(urgent, 1.0))
         return self._body_objectives(state, measurement, velocity, pose, spin, dt, share=share)
 
     def _ramp_or_full(self, time: float, unit: float) -> float:
-        """Return the value of ``_ramp``, or 1 for a jump that turns."""
+        """Return the fraction of the full weight of ``_ramp``; 1 for a jump that turns."""
         return 1.0 if self.facing.target_heading else self._ramp(time, unit)
 
     def _ramp(self, time: float, unit: float) -> float:
-        """Return the fraction of the full weight at ``time`` s; it ramps up over ``unit`` sqrt(H / g) from the start of
-        the phase."""
+        """Return the fraction of the full weight at ``time`` s; it grows to 1 within ``unit`` sqrt(H / g) after the
+        start of the phase."""
         share = min((time - self._entered) / (unit * self._time_unit), 1.0)
         return share * share * (3.0 - 2.0 * share)
 
@@ -404,7 +403,7 @@ class Jump:
         return self.controller.turn_towards(measurement, pose) * 4.0 / self._time_unit
 
     def _sufficient_speed(self, measurement: Measurement, dt: float) -> float:
-        """Return the upward speed in m/s at the end of this time step from which free flight reaches the target
+        """Return the upward speed in m/s at the end of this time step with which free flight reaches the target
         height."""
         rise = self._start_com[2] + AIM_RISE_FRACTION * self.target.height - measurement.com[2]
         return sufficient_speed(rise, self.gravity, dt)
@@ -419,8 +418,8 @@ class Jump:
         return np.array([ahead, position[1], self._start_com[2]])
 
     def _touch_down(self, measurement: Measurement, dt: float) -> tuple[np.ndarray, float]:
-        """Predict the touch-down: the centre of mass (3,) when the feet have fallen by their present height, and the
-        seconds until then."""
+        """Predict the touch-down, when the feet have fallen by their present height: the position (3,) of the centre of
+        mass, m, and the time until then, s."""
         speed, gap = measurement.velocity[2], max(measurement.sole_height, 0.0)
         drop = max(measurement.com[2] - self._start_com[2], 0.0)
         latest = max((speed + np.sqrt(max(speed**2 + 2.0 * self.gravity * drop, 0.0))) / self.gravity, dt)
@@ -428,18 +427,18 @@ class Jump:
         return np.array([*(measurement.com[:2] + measurement.velocity[:2] * left), self._start_com[2]]), left
 
     def _foothold(self, state: BodyState, measurement: Measurement, touch_down: np.ndarray, left: float) -> np.ndarray:
-        """Return the foothold (2,) for a landing in ``left`` seconds: the target, if the body can come to rest over it,
-        otherwise the nearest point at which it can."""
+        """Return the foothold (2,) for a landing in ``left`` seconds: the target if the body can come to rest over it,
+        otherwise the nearest point over which it can."""
         if (
             measurement.velocity[2] > 0.0
             and self.ground.local(state.positions)[:, 2].min() < STEP_CLEARANCE * self.target.rise
         ):
-            # Feet that swing forward before they are higher than the step would strike it.
+            # Feet that swing forward before they are higher than the step in the ground would strike it.
             return touch_down[:2] + measurement.foot_centre - measurement.com[:2]
         falling = max(left * self.gravity - measurement.velocity[2], 0.0)
         capture_time = stopping_time(self.controller.standing_height, falling, self.gravity, self._landing_time)
         capture = touch_down[:2] + measurement.velocity[:2] * capture_time + self.controller.base_offset
-        # Keep the capture point within this part of the footprint: the offset of the capture point from the foothold.
+        # Limit the offset of the capture point from the foothold to this part of the footprint.
         return capture - nearest_in_half_planes(
             self.controller.footprint.normals, self._max_foothold_offsets(), capture - self._start_base
         )
@@ -474,15 +473,15 @@ class Jump:
             spin: (3,) rad/s, target spin, world axes.
             dt: time step, s.
             left: time until the landing of a body in the air, s; None on the ground.
-            share: fraction of the weights of balance while landing, and of the pose in the air.
+            share: factor on the weights of balance during the landing, and on the weight of the pose in the air.
         """
-        # If a phase begins with a pose that differs from the last one, the poses are blended over several time steps.
+        # If a phase begins with another pose than the last phase, the poses are blended over several time steps.
         pose = self._pose_before + self._ramp(state.time + dt, POSE_BLEND_TIME) * (pose - self._pose_before)
         rate = (pose - self._last_pose) / dt
         if np.abs(rate).max() > 5.0 / self._time_unit:
             rate = np.zeros((3, 3))
         self._last_pose = pose
-        # The ground must stop the fall: objectives of free fall would make the muscles pull the feet away from it.
+        # The ground must stop the fall; with free fall as the objective, the muscles would pull the feet away from it.
         falling = self.phase is JumpPhase.FLIGHT and float(com_velocity[2]) < 0.0
         follow, weights = 6.0 / self._time_unit, self.weights
         if self.phase is JumpPhase.LAND or falling:

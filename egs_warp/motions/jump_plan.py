@@ -1,4 +1,4 @@
-"""Plan of a jump, from its target and the body's height alone (docs/concepts/motions.md)."""
+"""Plan of a jump, computed from its target and dimensions of the body (docs/concepts/motions.md)."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 from egs_warp.motions.style import Style
 
 EXIT_SPEED_FACTOR = 2.0
-"""Forward speed at the end of a crouch, in leans per crouch time: 2 corresponds to a constant acceleration, 0 to a
-stop."""
+"""Forward speed at the end of a crouch, in units of lean / crouch time. 2 corresponds to a constant acceleration, 0 to
+a stop."""
 LEAN_FRACTION = 0.15
-"""Fraction of the jump distance by which the centre of mass moves forward before take-off. From the middle of the feet,
-a forward push would rotate the body backward."""
+"""Forward displacement of the centre of mass before take-off, as a fraction of the jump distance. Without it, a forward
+push would rotate the body backward."""
 MAX_LEAN = 0.35
 """Largest lean, as a fraction of the horizontal distance from the centre of mass to the front of the feet."""
 MAX_CROUCH = 0.26
-"""Deepest crouch, as a fraction of the height of the centre of mass. Deeper crouches would compress elements to a fifth
-of their size, so a higher jump has a harder thrust instead."""
+"""Maximum depth of a crouch, as a fraction of the height of the centre of mass. Deeper crouches would compress elements
+to a fifth of their size, so a higher jump has a harder thrust instead."""
 THRUST_ACCELERATION = 2.8
 """Mean acceleration of a thrust, in g. A harder thrust needs a shallower crouch, which strains a stiff body less."""
 FRICTION_FRACTION = 0.9
@@ -27,23 +27,23 @@ FRICTION_FRACTION = 0.9
 longer, from a crouch that is deeper by at most ``MAX_EXTRA_CROUCH`` body heights."""
 _MIN_FRICTION = 1e-6
 MIN_CROUCH, MAX_EXTRA_CROUCH = 0.02, 0.02
-"""Smallest depth of a crouch in body heights, without the displacement of half a time step, and largest additional
-depth for the sake of friction."""
+"""Minimum depth of a crouch, without the displacement of half a time step, and maximum additional depth if friction
+limits the forward speed, both in body heights."""
 THRUST_START_FRACTION, THRUST_RAMP_FRACTION = 0.3, 0.4
 """Fraction of its full acceleration with which a thrust starts after the crouch, and fraction of its duration until the
 full acceleration is reached."""
 
 _MAX_EXTENSION, _MAX_EXTENSION_FRACTION = 0.04, 0.25
-"""Rise of the centre of mass above its standing height at take-off: in body heights, and at most this fraction of the
-height of the jump."""
+"""Limits of the rise of the centre of mass above its standing height at take-off: in body heights, and as a fraction of
+the height of the jump."""
 SETTLE_TIME = 0.3
-"""Time before the crouch starts, in sqrt(H / g)."""
+"""Time from the start of the motion to the start of the crouch, in sqrt(H / g)."""
 USUAL_LANDING_TIME, USUAL_LANDING_TIME_PER_DISTANCE = 0.7, 1.0
 """Typical time from touch-down to rest in sqrt(H / g), and additional time per body height of jump distance (measured
 on the pawn)."""
 LANDING_TIME = 0.35
-"""Time in sqrt(H / g) in which the fall of a body on legs is stopped, while it moves on over its feet (measured on the
-robot, whose feet stay where they touch down)."""
+"""Time in sqrt(H / g) in which the fall of a body on legs is stopped while it moves forward over its feet (measured on
+the robot, whose feet do not move after touch-down)."""
 
 
 class JumpPhase(Enum):
@@ -74,15 +74,16 @@ class JumpPlan:
     crouch_depth: float
     extension: float
     crouch_time: float
-    """A whole number of time steps, so that the objectives are continuous where the thrust starts."""
+    """Duration of the crouch, s: a whole number of time steps, so that the objectives are continuous where the thrust
+    starts."""
     thrust_time: float
     flight_time: float
     speed_up: float
     speed_forward: float
     lean: float
-    """Forward displacement of the centre of mass during the crouch."""
+    """Forward displacement of the centre of mass during the crouch, m."""
     landing_lag: float
-    """Distance of the centre of mass behind its standing position over the feet at touch-down."""
+    """Distance of the centre of mass behind its standing position over the feet at touch-down, m."""
     landing_rate: float
     """1/s, natural frequency of the descent on landing."""
     landing_damping: float
@@ -95,21 +96,23 @@ class JumpPlan:
 
     @property
     def _onset(self) -> np.ndarray:
-        """(3,) m/s, velocity at the end of the crouch: at rest vertically but already moving forward, because friction
-        can transmit little during the thrust."""
+        """(3,) m/s, velocity at the end of the crouch: zero upward but already forward, because friction limits the
+        forward acceleration during the thrust."""
         return np.array([min(EXIT_SPEED_FACTOR * self.lean / self.crouch_time, self.speed_forward), 0.0, 0.0])
 
     def crouch(self, start: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position and velocity (3,) of the centre of mass that stood at ``start`` (3,), ``elapsed`` seconds
-        into the crouch."""
+        """Return position (3,) and velocity (3,) of the centre of mass ``elapsed`` seconds into the crouch; ``start``
+        (3,) is its standing position."""
         s = min(elapsed / self.crouch_time, 1.0)
         blend, slope = s * s * (3 - 2 * s), 6 * s * (1 - s) / self.crouch_time
         carried, rate = s * s * (s - 1) * self.crouch_time, s * (3 * s - 2)
         return start + blend * self._down + carried * self._onset, slope * self._down + rate * self._onset
 
     def thrust(self, start: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position and velocity (3,) of the centre of mass ``elapsed`` seconds into the thrust, whose
-        acceleration grows to a constant value and ends at the take-off speed. ``start`` (3,) is the standing position.
+        """Return position (3,) and velocity (3,) of the centre of mass ``elapsed`` seconds into the thrust.
+
+        The acceleration grows to a constant value, and the thrust ends with the take-off velocity. ``start`` (3,) is
+        the standing position.
         """
         gained = np.array([self.speed_forward, 0.0, self.speed_up]) - self._onset
         speed, displacement = ramp_integrals(elapsed / self.thrust_time)
@@ -117,13 +120,14 @@ class JumpPlan:
         return position, self._onset + speed * gained
 
     def expected_duration(self, distance: float, time_unit: float) -> float:
-        """Return the seconds until a jump over ``distance`` body heights is at rest; ``time_unit`` is sqrt(H / g)."""
+        """Return the expected time in seconds until the body is at rest after a jump over ``distance`` body heights;
+        ``time_unit`` is sqrt(H / g), s."""
         landing = USUAL_LANDING_TIME + USUAL_LANDING_TIME_PER_DISTANCE * distance
         return self.crouch_time + self.thrust_time + self.flight_time + (SETTLE_TIME + landing) * time_unit
 
     def take_off_time(self, step: float) -> float:
-        """Return the seconds from the start of the crouch to the end of the thrust; both take whole time steps of
-        ``step`` s."""
+        """Return the time in seconds from the start of the crouch to the end of the thrust; both take whole numbers of
+        time steps of ``step`` s."""
         return step * float(sum(np.ceil(seconds / step - 1e-6) for seconds in (self.crouch_time, self.thrust_time)))
 
     def planned_displacement(self, elapsed: float, gravity: float) -> np.ndarray:
@@ -144,15 +148,16 @@ class JumpPlan:
 
 
 def sufficient_speed(rise: float, gravity: float, dt: float) -> float:
-    """Return the upward speed in m/s at the end of a time step of ``dt`` s from which free flight rises by ``rise``
-    metres above the start of the step."""
+    """Return the upward speed in m/s at the end of a time step of ``dt`` s with which free flight rises by ``rise``
+    metres above the position at the start of the step."""
     step_gain = gravity * dt  # v dt + (v - g dt/2)^2 / 2g = rise, solved for v
     return float(max(-0.5 * step_gain + np.sqrt(max(2.0 * gravity * rise, 0.0)), 0.0))
 
 
 def ramp_integrals(share: float) -> tuple[float, float]:
-    """Return speed and displacement of a thrust after the fraction ``share`` of its duration, relative to the gained
-    speed and to that speed times the duration.
+    """Return the dimensionless speed and displacement of a thrust after the fraction ``share`` of its duration.
+
+    The unit of speed is the total gain of speed; the unit of displacement is this gain times the duration.
 
     The acceleration grows from ``THRUST_START_FRACTION`` to its full value over the first ``THRUST_RAMP_FRACTION`` of
     the thrust, because muscles cannot be switched on at once.
@@ -170,13 +175,14 @@ def ramp_integrals(share: float) -> tuple[float, float]:
 
 
 def stopping_time(com_height: float, fall_speed: float, gravity: float, landing_time: float = 0.0) -> float:
-    """Return the time t in seconds such that a body that lands at forward speed v, with its feet v t ahead of its
-    centre of mass, comes to rest over them.
+    """Return the time t in seconds such that a body that lands with forward speed v comes to rest over its feet if they
+    are v t ahead of its centre of mass at touch-down.
 
-    In a landing without spin, the ground force passes through the centre of mass at ``com_height`` h above the feet,
-    which are y ahead: y'' = W^2 y. W^2 = (g + w / T) / h during the ``landing_time`` T in which the ``fall_speed`` w is
-    stopped, and w^2 = g / h afterwards, when the capture point must be at the feet, -y' = w y. For T = 0, the landing
-    impulse reduces the forward speed by w y / h at once.
+    Let y be the distance of the feet ahead of the centre of mass, h its height above them (``com_height``), s the
+    ``fall_speed`` and T the ``landing_time`` in which the fall is stopped. In a landing without spin, the ground force
+    passes through the centre of mass, so y'' = W^2 y with W^2 = (g + s / T) / h during T, and W^2 = g / h afterwards.
+    After T, the capture point must be at the feet: -y' = sqrt(g / h) y. For T = 0, the landing impulse reduces the
+    forward speed by s y / h at once.
     """
     swaying = np.sqrt(gravity / com_height)
     if landing_time <= 0.0:
@@ -212,7 +218,7 @@ def plan_jump(
     landing_time: float = 0.0,
     style: Style | None = None,
 ) -> JumpPlan:
-    """Plan stroke, times and take-off velocity of a jump (docs/concepts/motions.md).
+    """Plan the stroke, the phase durations and the take-off velocity of a jump (docs/concepts/motions.md).
 
     Args:
         target: target of the jump.
@@ -224,7 +230,7 @@ def plan_jump(
         lean: forward displacement of the centre of mass during the crouch, m.
         friction: Coulomb coefficient of the ground.
         landing_time: time in which the fall is stopped, s.
-        style: factors of the jump; None is the default style.
+        style: factors of the jump; None uses the default style.
     """
     style = style or Style()
     time_unit = np.sqrt(height / gravity)
@@ -232,7 +238,7 @@ def plan_jump(
     rise = target.height - extension
     speed_up = np.sqrt(2.0 * gravity * rise) + 0.5 * gravity * step
     flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
-    # The front of the footprint helps a landing body to stop over its base.
+    # The part of the footprint in front of the centre of mass helps a landing body to stop.
     fall_speed = np.sqrt(2.0 * gravity * max(rise - target.rise, 0.0))
     capture_time = stopping_time(com_height, fall_speed, gravity, landing_time)
     footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
@@ -240,15 +246,14 @@ def plan_jump(
     acceleration = THRUST_ACCELERATION * gravity / style.timing
     min_stroke = extension + MIN_CROUCH * height
     stroke = max(speed_up**2 / (2.0 * acceleration), min_stroke)
-    # A low, long jump spends long on the ground: the forward impulse is bounded by friction times the normal impulse,
-    # which consists of the upward momentum and the weight.
+    # A low, long jump needs a long thrust: the forward impulse is at most the friction coefficient times the normal
+    # impulse, which is the upward momentum plus the impulse of the weight.
     ahead = (target.distance - lean + footprint_help) / (
         flight_time + capture_time
     ) - EXIT_SPEED_FACTOR * lean / crouch_time
     needed = (ahead / (FRICTION_FRACTION * max(friction, _MIN_FRICTION)) - speed_up) / gravity
     stroke = max(stroke, min(ramp_integrals(1.0)[1] * speed_up * needed, min_stroke + MAX_EXTRA_CROUCH * height))
-    # Each time step moves at the velocity of its end, which adds half a time step of displacement to that of the
-    # thrust.
+    # Each time step moves with the velocity at its end, which adds half a time step of displacement to the thrust.
     stroke += 0.5 * speed_up * step
     crouch_depth = min(style.anticipation * (stroke - extension), MAX_CROUCH * com_height)
     displacement = crouch_depth + extension - 0.5 * speed_up * step

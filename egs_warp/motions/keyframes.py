@@ -1,9 +1,9 @@
-"""Key frames of a user's trajectory, from JSON or CSV: target values of parts of the body over time.
+"""Key frames from JSON or CSV files: target values over time for parts of the body.
 
 See docs/concepts/motions.md.
 
 JSON: a list of keys, ``[{"time": 0.5, "part": "head", "quantity": "position", "value": [0.1, 0, 0]}]``. CSV: a header
-``time,part,quantity,x,y,z`` and one key per row. Both may give a ``weight``.
+``time,part,quantity,x,y,z`` and one key per row. Keys in both formats may have a ``weight``.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ class Quantity(Enum):
     POSITION = "position"
     """Displacement from the start, body heights."""
     VELOCITY = "velocity"
-    """Body heights per second."""
+    """Velocity, body heights per second."""
     ORIENTATION = "orientation"
-    """Rotation from the start as a rotation vector, degrees; its length gives the direction: 270 differs from -90."""
+    """Rotation vector relative to the start, degrees. Full turns are distinguished: 270 differs from -90."""
     ANGULAR_MOMENTUM = "angular_momentum"
-    """Angular momentum about the centre of the part, in body mass times squared height per second."""
+    """Angular momentum about the centre of the part, body mass times body height squared per second."""
 
 
 PARTS = ("body", "base", "head", "foot")
-"""Parts that a key may name: the whole body, whose position is that of the centre of mass, the base on the ground, the
-head at the top, and the foot of a body with one foot. Several feet are numbered, as ``foot 2``, and so are branches."""
+"""Parts to which a key may refer: the whole body, whose position is its centre of mass; the base on the ground; the
+head at the top; and the foot of a body with one foot. Several feet and branches are numbered, as in ``foot 2``."""
 _NUMBERED_PART = re.compile(r"(?:foot|branch) [1-9]\d?")
 MAX_TIME = 60.0
-"""Seconds."""
+"""Maximum time of a key, s."""
 MIN_GAP = 0.001
-"""Smallest time in seconds between two keys of a channel, and before the first key."""
+"""Minimum time in seconds between two keys of a channel, and before its first key."""
 MAX_LENGTH: Mapping[Quantity, float] = {
     Quantity.POSITION: 10.0,
     Quantity.VELOCITY: 20.0,
     Quantity.ORIENTATION: 360.0,
     Quantity.ANGULAR_MOMENTUM: 10.0,
 }
-"""Largest length of a value; larger ones are rejected as typing errors."""
+"""Maximum length of a value in the unit of its quantity; larger values are rejected as typing errors."""
 _FIELDS = ("time", "part", "quantity", "value", "weight")
 
 
@@ -60,20 +60,20 @@ class Key:
     """One key frame."""
 
     time: float
-    """Seconds from the start of the motion."""
+    """Time from the start of the motion, s."""
     part: str
     quantity: Quantity
     value: tuple[float, float, float]
     weight: float = 1.0
-    """Weight relative to that of the motion, in the interval that ends at this key."""
+    """Factor on the weight of the motion, in the interval that ends at this key."""
     where: str = ""
-    """File and position in it, for messages."""
+    """File and position of the key in it, for messages."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """All keys of one part and quantity, interpolated by a monotone cubic from zero at time 0; the value is constant
-    after the last key."""
+    """All keys of one part and quantity, interpolated by a monotone cubic spline that starts with zero at time 0. The
+    value is constant after the last key."""
 
     part: str
     quantity: Quantity
@@ -85,19 +85,19 @@ class Channel:
     """(k,) weights of the keys."""
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the value (3,) and its rate (3,) per second at ``time``."""
+        """Return the value (3,) and its rate (3,) per second at ``time`` s."""
         inside = min(time, float(self.times[-1]))
         curve = PchipInterpolator(self.times, self.values, axis=0)
         return curve(inside), curve(inside, 1) * (time < self.times[-1])
 
     def second_rate(self, time: float) -> np.ndarray:
-        """Return the second derivative (3,) per square second at ``time``; zero after the last key."""
+        """Return the second derivative (3,) per square second at ``time`` s; zero after the last key."""
         if time >= self.times[-1]:
             return np.zeros(3)
         return PchipInterpolator(self.times, self.values, axis=0)(time, 2)
 
     def weight_at(self, time: float) -> float:
-        """Return the weight of the next key, or of the last key after it."""
+        """Return the weight of the first key after ``time`` s; after the last key, the weight of that key."""
         return float(self.weights[min(np.searchsorted(self.times[1:], time), len(self.weights) - 1)])
 
 
@@ -119,7 +119,7 @@ def read_keyframes(path: Path) -> tuple[Key, ...]:
 
 
 def checked_keys(keys: Sequence[Key]) -> tuple[Key, ...]:
-    """Return ``keys`` with the checks of a file.
+    """Return ``keys`` after the same checks as for the keys of a file.
 
     Raises:
         UserError: for the first malformed key, by its number.

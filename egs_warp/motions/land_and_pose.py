@@ -1,4 +1,5 @@
-"""Jump that lands in a low crouch and holds it, with the head up, before the body stands (docs/motions/gestures.md)."""
+"""Jump that lands in a low crouch and holds it, with the head up, before the body stands up
+(docs/motions/gestures.md)."""
 
 from __future__ import annotations
 
@@ -36,7 +37,7 @@ class LandAndPose:
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the body stands again, at rest."""
+        """True if the body stands at rest again."""
         return self._pose is not None and self._pose.is_at_rest
 
     @property
@@ -61,8 +62,8 @@ class LandAndPose:
         return self.jump.notes()
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         if self._pose is None and self.jump.is_at_rest:
             stance = self._stance.next_stance(state.positions, report)
             self._pose = Act(stance, [(0.0, landed_pose(stance, self._depth, self._seconds))])

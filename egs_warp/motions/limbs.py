@@ -1,7 +1,8 @@
 """Limbs on which a body stands: branches of its horizontal sections that reach the ground.
 
-Horizontal sections of a solid and their contacts form the Reeb graph of its height. Limbs are found where they are
-separate, which may be above feet that have merged, and are followed up to where they join and down to the ground.
+The horizontal sections of a solid and their contacts form the Reeb graph of its height. Limbs are detected at levels on
+which they are separate, which may be above merged feet. They are then followed up to their junctions and down to the
+ground.
 """
 
 from __future__ import annotations
@@ -21,22 +22,24 @@ from egs_warp.muscles.level_set_cells import LevelSetCells
 _SECTION_THICKNESS = 0.02
 """Thickness of a section of a mesh, in body heights."""
 _CUT_MARGIN = 1e-3
-"""Smallest distance of cuts from nodes, in section thicknesses."""
+"""Minimum distance of cuts from nodes, in section thicknesses."""
 _NEAR_GROUND = 0.07
 """Maximum height in body heights of the end of a limb that stands on the ground; a limb that ends higher hangs."""
 _MIN_LIMB_HEIGHT = 0.08
-"""Smallest height in body heights over which a limb is separate from all others; a shorter one is a toe."""
+"""Minimum height in body heights over which a limb is separate from all others; a shorter branch is a toe."""
 _MAX_MERGED_HEIGHT = 0.1
-"""Height in body heights, or a mean edge length of the mesh if that is more; limbs that are connected on the ground
-over a larger height form one base."""
+"""Maximum height of a connection on the ground between two limbs that do not form one base, in body heights; at least
+the mean edge length of the mesh."""
 _MAX_GAP = 0.5
-"""Largest gap between two limbs, in body heights, across which a connection may be a flaw of the capture."""
+"""Maximum gap between two limbs, in body heights, across which a connection may be an artefact of the capture."""
 
 
 @dataclass(frozen=True)
 class Sections:
-    """Connected slabs of equal thickness of a solid, and which of them touch. S sections, N nodes of the body's
-    cage."""
+    """Horizontal sections of a solid: connected slabs of equal thickness, and the pairs that touch.
+
+    In the shapes below, S is the number of sections, J of pairs, and N of nodes of the body's cage.
+    """
 
     thickness: float
     """Thickness of a section, m."""
@@ -45,13 +48,13 @@ class Sections:
     centres: np.ndarray
     """(S, 3) m, approximate centres."""
     volumes: np.ndarray
-    """(S,) m^3."""
+    """(S,) m^3, volumes."""
     joints: np.ndarray
-    """(J, 2) int, touching sections on consecutive levels, the lower one first."""
+    """(J, 2) int, pairs of touching sections on consecutive levels, the lower one first."""
     section_from_node: np.ndarray
-    """(N,) int, section that contains each node of the cage, or the nearest one."""
+    """(N,) int, section that contains each node of the cage, otherwise the section nearest to it."""
     melt: float
-    """Largest height in metres over which parts that are connected on the ground may be separate in reality."""
+    """Maximum height in metres of a connection on the ground between parts that may be separate in reality."""
 
     @classmethod
     def of_mesh(cls, mesh: TetMesh, heights: np.ndarray) -> Sections:
@@ -59,7 +62,7 @@ class Sections:
         size = float(np.ptp(heights))
         thickness = _SECTION_THICKNESS * size
         field = (heights - heights.min()) / thickness
-        # A face that lies in a cut would belong to no cell.
+        # Move nodes out of the cuts, because a face in a cut would belong to no cell.
         field = np.where(np.abs(field - np.rint(field)) < _CUT_MARGIN, np.rint(field) + _CUT_MARGIN, field)
         cells = LevelSetCells.cut(mesh.tets, field, level_count=int(np.ceil(field.max())))
         count, section = _components(cells.count, cells.touching)
@@ -81,8 +84,8 @@ class Sections:
 
     @classmethod
     def of_solid(cls, solid: LatticeSolid, mesh: TetMesh) -> Sections:
-        """Return the sections of the ``solid`` around which the cage ``mesh`` was made and whose gaps are finer than
-        those of the mesh; both are in the frame of the body."""
+        """Return the sections of the ``solid`` around which the cage ``mesh`` was generated. The solid resolves
+        narrower gaps than the mesh; both are in the frame of the body."""
         cells = np.argwhere(solid.inside)
         number = np.full(solid.inside.shape, -1)
         number[tuple(cells.T)] = np.arange(len(cells))
@@ -113,7 +116,7 @@ def _components(count: int, pairs: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def _distinct(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return the distinct pairs (P, 2) of numbers below ``count``."""
+    """Return the distinct rows (P, 2) of ``pairs`` (n, 2), which contain numbers below ``count``."""
     return np.stack(np.divmod(np.unique(pairs[:, 0].astype(np.int64) * count + pairs[:, 1]), count), axis=1)
 
 
@@ -129,21 +132,21 @@ def _centres(section: np.ndarray, points: np.ndarray, masses: np.ndarray, count:
 
 @dataclass(frozen=True)
 class Limbs:
-    """Limbs on which a body stands. N nodes."""
+    """Limbs on which a body stands; N is the number of nodes."""
 
     limb_from_node: np.ndarray
-    """(N,) int, limb of each node, -1 for the body above the limbs."""
+    """(N,) int, limb of each node, -1 for nodes above the limbs."""
     tops: tuple[float, ...]
     """Heights in metres above the ground at which each limb joins another or the body ends."""
 
     @property
     def count(self) -> int:
-        """Number of limbs, at least 1: a body without limbs or on a single limb counts as one limb."""
+        """Number of limbs; a body without limbs is considered one limb."""
         return len(self.tops)
 
 
 def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
-    """Find the limbs of a body that reach the ground; ``nodes`` (N, 3), m, are those of its cage."""
+    """Find the limbs of a body that reach the ground; ``nodes`` (N, 3), m, are the nodes of its cage."""
     graph = _Graph(sections)
     candidates = [graph.limbs_through(crossing) for crossing in graph.crossings()]
     bases = [graph.bases(limbs) for limbs in candidates]
@@ -156,7 +159,7 @@ def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
     for limb, base in zip(limbs, base_from_limb, strict=True):
         base_from_section[list(limb.own)] = base
     limb_from_node = base_from_section[sections.section_from_node]
-    # Feet that have merged are split halfway between their limbs.
+    # Merged feet are split halfway between their limbs.
     shared = np.isin(sections.section_from_node, list(graph.shared_below(limbs)))
     ends = np.array([sections.centres[list(limb.lowest), :2].mean(axis=0) for limb in limbs])
     limb_from_node[shared] = base_from_limb[np.asarray(KDTree(ends).query(nodes[shared, :2])[1], int)]
@@ -168,7 +171,7 @@ def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
 
 
 def _score(limbs: Sequence[_Limb], base_from_limb: np.ndarray) -> int:
-    """Return the number of levels over which each foot is separate, summed over the feet; 0 for fewer than two feet."""
+    """Return the sum over the feet of the number of levels on which a foot is separate; 0 for fewer than two feet."""
     apart = np.zeros(int(base_from_limb.max(initial=-1)) + 1, int)
     np.maximum.at(apart, base_from_limb, [limb.apart for limb in limbs])
     return int(apart.sum()) if len(apart) > 1 else 0
@@ -185,9 +188,9 @@ class _Limb:
     bottom: int
     """Lowest level of the limb."""
     top: int
-    """Level at which it joins another limb."""
+    """Level at which the limb joins another one."""
     is_joined: bool
-    """True if it shares the sections below with another limb."""
+    """True if the limb and another one share sections below ``own``."""
 
     @property
     def apart(self) -> int:
@@ -196,7 +199,7 @@ class _Limb:
 
 
 class _Graph:
-    """Graph of the sections: each is connected to those that touch it from above and below."""
+    """Graph of the sections: each section is connected to the sections that touch it from above and below."""
 
     def __init__(self, sections: Sections) -> None:
         self.sections = sections
@@ -217,8 +220,8 @@ class _Graph:
         self._bar = _MAX_GAP * self.height
 
     def crossings(self) -> list[list[int]]:
-        """Return, for each level that has two or more of them, the sections that lead down to the ground and support
-        the body."""
+        """Return the sections that are connected downwards to the ground and support the body, for each level with at
+        least two such sections."""
         grounded = [level <= self._near for level in self.levels]
         for level in self.by_level:
             for section in level:
@@ -242,7 +245,7 @@ class _Graph:
                         mass[mine] += mass[other]
             if not level:
                 continue
-            # A part that is separate from the body up to its top, such as a tail, supports nothing.
+            # A part that is not connected to the body above this level, such as a tail, supports nothing.
             body = max(map(find, level), key=lambda one: mass[one])
             crossing = [section for section in level if find(section) == body and grounded[section]]
             if len(crossing) > 1:
@@ -268,8 +271,8 @@ class _Graph:
         """Follow the graph from each section until it meets another section's path.
 
         Returns:
-            For each section, the number of levels that its path covers, the sections of the path, those on its last
-            level, and True if it met another path.
+            For each section: the number of levels that its path covers, the sections of the path, the sections on its
+            last level, and True if it has met another path.
         """
         count = len(crossing)
         front: list[set[int]] = [{section} for section in crossing]
@@ -289,8 +292,8 @@ class _Graph:
         return level_counts, own, last, met
 
     def bases(self, limbs: Sequence[_Limb]) -> np.ndarray:
-        """Return the foot number (limbs,) of each limb. Limbs share a foot if they are connected over a large height,
-        or by a bar without another limb between them."""
+        """Return the index of the foot (limbs,) of each limb. Limbs share a foot if they are connected on the ground
+        over a large height, or by a bar without another limb between them."""
         if not limbs:
             return np.zeros(0, int)
         under = [self._ground_under(limb) for limb in limbs]
@@ -310,7 +313,7 @@ class _Graph:
         return float(np.linalg.norm(second - first) - 0.5 * sum(sides))
 
     def _ground_under(self, limb: _Limb) -> set[int]:
-        """Return the lowest sections that are reached by going down from the limb."""
+        """Return the lowest sections on the downward paths from the limb."""
         below = set(limb.lowest)
         while further := set().union(*(self.down[section] for section in below)):
             below = further

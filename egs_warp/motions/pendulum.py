@@ -1,8 +1,8 @@
-"""Linear inverted pendulum model of the centre of mass of a walking body: c'' = w^2 (c - p), p the centre of pressure.
+"""Linear inverted pendulum model of a walking body: c'' = w^2 (c - p), centre of mass c, centre of pressure p.
 
-The divergent component of its motion is x = c + c' / w, with x' = w (x - p) (the instantaneous capture point; Pratt et
-al. 2006; as a plan: Englsberger et al. 2015, "Three-dimensional bipedal walking control based on divergent component of
-motion").
+The divergent component of motion is x = c + c' / w, with x' = w (x - p). It is the instantaneous capture point of Pratt
+et al. (2006). Plans of it follow Englsberger et al. (2015), "Three-dimensional bipedal walking control based on
+divergent component of motion".
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class PendulumPlan:
 
     @classmethod
     def from_pressure(cls, pressure: np.ndarray, step: float, rate: float) -> PendulumPlan:
-        """Return the motion under the centre of pressure ``pressure`` (n, 2) that does not diverge after its end; it is
-        unique. ``rate`` is w, 1/s."""
+        """Return the unique plan with the centres of pressure ``pressure`` (n, 2) whose motion does not diverge after
+        the last interval. ``rate`` is w, 1/s."""
         divergent = np.empty((len(pressure) + 1, 2))
         divergent[-1] = pressure[-1]
         shrink = np.exp(-rate * step)
@@ -34,7 +34,7 @@ class PendulumPlan:
         return cls(step, pressure, divergent)
 
     def at(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return centre of pressure and divergent component (2,) ``elapsed`` seconds after the start."""
+        """Return the centre of pressure (2,) and the divergent component (2,) ``elapsed`` seconds after the start."""
         k = min(int(elapsed / self.step), len(self.pressure) - 1)
         part = min(elapsed / self.step - k, 1.0)
         return self.pressure[k], (1.0 - part) * self.divergent[k] + part * self.divergent[k + 1]

@@ -1,8 +1,8 @@
 """Pushes and gusts that act on a body while it moves.
 
-A text lists pushes, separated by commas. Each gives a time in seconds, an impulse in m sqrt(g H), a direction and,
-optionally, the height in body heights around which it acts; without a height, it acts on all nodes alike. ``0.5 0.1
-left, 1.2 0.3 back 0.8`` are two pushes. A push with a time interval is a gust: ``0.5-1.5 0.4 left``.
+A text lists pushes, separated by commas: ``0.5 0.1 left, 1.2 0.3 back 0.8``. Each push has a time in seconds, an
+impulse in m sqrt(g H), a direction and, optionally, the height in body heights around which it acts. A push without a
+height acts on all nodes alike. A push with a time interval is a gust: ``0.5-1.5 0.4 left``.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Push:
     impulse: np.ndarray
     """(3,) m sqrt(g H), forward, left and up relative to the body at the start."""
     height: float | None = None
-    """Height above the sole in body heights around which the push acts; None: on all nodes alike."""
+    """Height above the sole, in body heights, around which the push acts; None for all nodes alike."""
     duration: float = 0.0
     """Duration of a gust, s; 0 for a push at a single time."""
 
@@ -62,8 +62,8 @@ class Push:
                 raise ArgumentError(name, f"give a number from 0 to {maximum:g}", value=f"{value:g}")
 
     def unapplied_note(self, end: float) -> str | None:
-        """Return a message for the user about the part that did not act before the run ended at ``end`` s; None if all
-        of it did."""
+        """Return a message for the user about the part of the push that did not act before the run ended at ``end`` s;
+        None if the push acted completely."""
         if self.time > end - _ROUNDING:
             return f"the push at {self.time:g} s did not act: the run ended earlier"
         over = self.time + self.duration
@@ -72,7 +72,7 @@ class Push:
         )
 
     def share(self, time: float, dt: float) -> float:
-        """Return the fraction of the impulse that acts in the time step of ``dt`` s from ``time`` s on."""
+        """Return the fraction of the impulse that acts in the time step of ``dt`` s that starts at ``time`` s."""
         start, end = self.time - time, self.time + self.duration - time
         if self.duration == 0.0:
             return float(-_ROUNDING <= start < dt - _ROUNDING)
@@ -91,8 +91,8 @@ class PushKicks:
         self._velocities = [kick_of(stance, push.impulse @ stance.ground.axes, push.height) for push in pushes]
 
     def __call__(self, time: float, dt: float) -> np.ndarray | None:
-        """Return the velocity change (N, 3) in m/s of the nodes in the time step of ``dt`` s from ``time`` s on; None
-        without a push."""
+        """Return the velocity change (N, 3) in m/s of the nodes in the time step of ``dt`` s that starts at ``time`` s;
+        None without a push."""
         shares = [push.share(time, dt) for push in self._pushes]
         if not any(shares):
             return None
@@ -105,7 +105,7 @@ def kick_of(stance: Stance, impulse: np.ndarray, height: float | None) -> np.nda
     Args:
         stance: stance of the body.
         impulse: (3,) m sqrt(g H), world axes.
-        height: height above the sole in body heights around which the impulse acts; None: on all nodes alike.
+        height: height above the sole, in body heights, around which the impulse acts; None for all nodes alike.
     """
     body = stance.body
     near = np.ones(len(body.node_mass))

@@ -1,4 +1,4 @@
-"""Registry of the motions by name: parameters, construction and time limit of each."""
+"""Registry of the motions by name, with their parameters, construction and time limits."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ from egs_warp.motions.values import Value
 _STEP = 0.1
 """Default length of a step, in body heights."""
 _STEP_FRACTION = "step_fraction"
-"""Value of a retake: length and turn of the steps, as a fraction of the usual ones."""
+"""Name of a retake's value: factor on the length and turn of steps."""
 _REST_FRAMES = 120
-"""Frames after the requested time within which a standing body that was pushed comes to rest."""
+"""Number of frames after the requested time within which a pushed standing body must come to rest."""
 _CLOSING_FRAMES = 300
-"""Frames after the last command of a drive within which the body brings its feet together and comes to rest."""
+"""Number of frames after the last command of a drive within which the body must bring its feet together and rest."""
 TRAJECTORY_TAIL = 200
-"""Frames after the last key of a trajectory within which the body comes to rest."""
+"""Number of frames after the last key of a trajectory within which the body must come to rest."""
 
 
 @dataclass(frozen=True)
 class MotionKind:
-    """Motion that a script can name."""
+    """Kind of motion to which a script can refer by name."""
 
     parameters: tuple[Value, ...]
     """Parameters, in the order in which numbers without names are read."""
     build_tasks: Callable[[MotionRequest, float], list[MotionTask]]
-    """Build the tasks of a request, with all repeats, for a body of the given height in metres. Raises ``UserError``
-    for an invalid file."""
+    """Function that builds the tasks of a request, with all repeats, for a body of the given height in metres. It
+    raises ``UserError`` for an invalid file."""
     frames: Callable[[MotionRequest], int]
-    """Number of frames at 60 Hz within which one repeat comes to rest; a longer motion is cut off."""
+    """Function that returns the number of frames at 60 Hz after which one repeat is cut off."""
     file: str | None = None
     """Description of the file that the motion needs, for messages; None if it needs none."""
     jumps: bool = False
@@ -61,9 +61,9 @@ class MotionKind:
     beats: bool = False
     """True if the motion accepts a file of beats instead of its numbers."""
     retakes: tuple[Retake, ...] = ()
-    """Changes of the motion for the first and each further retake after a fall."""
+    """Changes of the motion for the retakes after falls, in order."""
     gesture: Callable[[Stance, Mapping[str, float]], Gesture] | None = None
-    """Builds the gesture of a motion that may run on top of another one."""
+    """Function that builds the gesture of a motion that may run on top of another one; None for other motions."""
 
     def usage(self, name: str) -> str:
         """Describe the parameters of the motion called ``name``, for messages."""
@@ -213,10 +213,10 @@ _STEP_LENGTH = Value("step_length", _STEP, 0.0, MAX_TARGET, "body heights", is_e
 _TURN_PATH = 2.5
 """Path length in body heights that takes as long as a full turn on the spot."""
 _FULL_TURN_PATH = 10.0
-"""Path length in body heights that takes as long as a full turn in a motion that only turns. It allows for a crawl,
-which takes four times as long."""
+"""Path length in body heights that takes as long as a full turn in a motion that only turns. It is four times as large,
+because turns of a crawl take longer."""
 _MIN_STEP = 0.02
-"""Step length of a narrow base in body heights, from which the time limit of a walk is computed."""
+"""Step length of a narrow base, in body heights, from which the time limit of a walk is computed."""
 
 
 def _length(name: str, default: float, *, is_exclusive: bool = False) -> Value:
@@ -254,7 +254,8 @@ def _acting_kind(kind: ActingKind) -> MotionKind:
 
 
 def _acting_values(request: MotionRequest) -> Mapping[str, float]:
-    """Return the values of the report: turns are also a heading, against which the turn is measured."""
+    """Return the requested values for the report; a turn is also reported as a heading, with which the reached one is
+    compared."""
     turns = request.asked.get("turns")
     return request.asked if turns is None else {**request.asked, "heading_degrees": 360.0 * turns}
 
@@ -375,8 +376,10 @@ def kind_of_request(request: MotionRequest) -> MotionKind:
 
 
 def tasks_of_request(request: MotionRequest, height: float) -> list[MotionTask]:
-    """Return the tasks of ``request``, with all repeats, for a body of ``height`` metres, in the style of the request
-    if it has one, and with its gestures. The tasks of a retake are gentler, and are judged by the requested values."""
+    """Return the tasks of ``request``, with all repeats, its style and its gestures, for a body of ``height`` metres.
+
+    The tasks of a retake are gentler, but are judged by the requested values.
+    """
     kind = kind_of_request(request)
     factors: Mapping[str, float] = {}
     parts = gentler = kind.build_tasks(request, height)
@@ -394,7 +397,7 @@ def tasks_of_request(request: MotionRequest, height: float) -> list[MotionTask]:
 def _begin_in_style(
     style: Style | None, factors: Mapping[str, float], begin: Callable[[Stance], BodyMotion], stance: Stance
 ) -> BodyMotion:
-    """Begin a motion in ``style``, that of the run if it is None, multiplied by ``factors``."""
+    """Begin a motion in ``style``, or in the style of the run if it is None, scaled by ``factors``."""
     return begin(replace(stance, style=(style or stance.style).scaled(factors)))
 
 
@@ -412,6 +415,6 @@ def _begin_with_layers(request: MotionRequest, begin: Callable[[Stance], BodyMot
 
 
 def frames_of_request(request: MotionRequest) -> int:
-    """Return the number of frames at 60 Hz within which one repeat comes to rest, with its gestures."""
+    """Return the number of frames at 60 Hz after which one repeat, with its gestures, is cut off."""
     layers = [60.0 * layer.begin + frames_of_request(layer.request) for layer in request.layers]
     return max(kind_of_request(request).frames(request), *map(round, layers), 0)

@@ -36,9 +36,9 @@ class MotionRequest:
     seconds: float = 0.0
     """Time limit of a motion that is not in the registry, s."""
     style: Style | None = None
-    """Style of its jumps, if it differs from that of the run."""
+    """Style of the jumps of this motion; None uses the style of the run."""
     retake: int = 0
-    """Number of times that the motion has been made gentler (``egs_warp.motions.retake``)."""
+    """Number of the retake (``egs_warp.motions.retake``); 0 is the motion as requested."""
     layers: tuple[LayerRequest, ...] = ()
     """Gestures on top of the motion."""
 

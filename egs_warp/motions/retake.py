@@ -1,4 +1,4 @@
-"""Gentler forms of the motions, in which a run is simulated again after a fall (docs/motions/retakes.md)."""
+"""Gentler forms of motions, with which a run is simulated again after a fall (docs/motions/retakes.md)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ class Retake:
     change: str
     """Description that follows the name of the motion in messages."""
     factors: Mapping[str, float] = field(default_factory=dict)
-    """Factors on the requested values by name; a motion without a value ignores its factor."""
+    """Factors on the requested values by name; factors for missing values are ignored."""
     replacements: Mapping[str, float] = field(default_factory=dict)
-    """Values by name that replace those requested, or the fixed values of a motion that has no such parameter."""
+    """Values by name that replace requested values, or fixed values of a motion without such a parameter."""
     style: Mapping[str, float] = field(default_factory=dict)
     """Factors on the style of jumps (``egs_warp.motions.style``)."""
 
     def values(self, requested: Mapping[str, float]) -> dict[str, float]:
-        """Return the values with which the motion is performed instead of those ``requested``."""
+        """Return the values with which the motion is performed instead of the ``requested`` ones."""
         scaled = {name: self.factors.get(name, 1.0) * value for name, value in requested.items()}
         return {**scaled, **self.replacements}

@@ -1,4 +1,4 @@
-"""Roll: a ball is driven by its centre of mass, which is held ahead of the centre of pressure within its soft sole.
+"""Roll: gravity drives a ball whose centre of mass is held ahead of the centre of pressure in its soft sole.
 
 See docs/concepts/motions.md.
 """
@@ -52,7 +52,7 @@ class RollOutcome:
     """Measured result of a roll."""
 
     rolled_degrees: float
-    """Total rotation about horizontal axes, in any direction."""
+    """Total rotation about horizontal axes, in any direction, degrees."""
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,8 @@ class Roll:
         return RollOutcome(float(np.degrees(angle)))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         body, axes, control = self.body, self.ground.axes, self.control
         self._start_time = state.time if self._start_time is None else self._start_time
         local = self.ground.local(state.positions)
@@ -170,7 +170,7 @@ class Roll:
     def _feasible_acceleration(
         self, desired: np.ndarray, com: np.ndarray, inertia: np.ndarray, local: np.ndarray, report: StepReport | None
     ) -> np.ndarray:
-        """Limit a desired acceleration along the ground to what the ground can provide.
+        """Limit a desired acceleration along the ground to one that the contact forces can produce.
 
         A ball that rolls without slipping gains speed and spin together: m r (1 + I / (m r^2)) a equals the weight
         times the distance from the centre of pressure to the centre of mass.
@@ -206,8 +206,8 @@ class Roll:
         return float(com[2] - self._slope @ com[:2])
 
     def _radius(self, positions: np.ndarray) -> float:
-        """Return the distance in metres from the centre of mass to the ground for the undeformed body in the
-        orientation of the nodes at ``positions`` (N, 3)."""
+        """Return the distance in metres from the centre of mass to the ground of the undeformed body, in the best-fit
+        orientation of nodes at ``positions`` (N, 3)."""
         turn = kabsch_rotation(self.body.node_mass, self._rest, positions - self.body.centre_of_mass(positions))
         normal, up = self.ground.surface_normal, self.ground.axes[2]
         return float(-(self._rest @ (turn.T @ normal)).min() / (normal @ up))

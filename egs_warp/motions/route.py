@@ -25,8 +25,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class StepLimits:
-    """Largest change of a body's planar pose in one step. The larger the rotation of a step, the shorter its
-    displacement."""
+    """Maximum change of a body's planar pose in one step. A larger rotation reduces the maximum displacement."""
 
     length: float
     """Largest displacement, m."""
@@ -44,7 +43,7 @@ Route = Callable[[StepLimits], np.ndarray]
 
 
 def straight_route(distance: float) -> Route:
-    """Return the route of ``distance`` metres forward in equal steps; backwards if it is negative."""
+    """Return the route of ``distance`` metres forward in equal steps; a negative distance leads backwards."""
 
     def planar_poses(limits: StepLimits) -> np.ndarray:
         count = max(int(np.ceil(abs(distance) / limits.length - _ROUNDING)), 1)
@@ -64,8 +63,8 @@ def turn_route(angle: float) -> Route:
 
 
 def path_route(points: np.ndarray) -> Route:
-    """Return the route through ``points`` (n, 2), m, that ends at the last one. A body that faces its direction of
-    travel turns on the spot where necessary.
+    """Return the route through ``points`` (n, 2), m. A body that faces its direction of travel turns on the spot where
+    necessary.
 
     Raises:
         UserError: when the route is called, if the path takes more than ``MAX_STEPS`` steps.

@@ -1,9 +1,9 @@
 """Scripts of one or several motions, from a line of text or a JSON file.
 
-A line lists motions, separated by commas. Each has its numbers in order or by name, and ``xN`` for N repeats: ``hop x3,
-twist 180, walk 2``, ``jump 0.5 height=0.3``, ``walk to 1,0.5``. ``+`` adds a gesture on top of a motion, ``at`` seconds
-after it has started: ``walk 1 + wave at=0.5``. A JSON file contains a list of objects: ``[{"motion":
-"hop", "repeat": 3}, {"motion": "twist", "heading_degrees": 180}]``.
+A line lists motions, separated by commas. Each motion has its numbers in order or by name, and ``xN`` for N repeats:
+``hop x3, twist 180, walk 2``, ``jump 0.5 height=0.3``, ``walk to 1,0.5``. ``+`` adds a gesture on top of a motion, and
+``at`` is the time in seconds from the start of the motion to the gesture: ``walk 1 + wave at=0.5``. A JSON file
+contains a list of objects: ``[{"motion": "hop", "repeat": 3}, {"motion": "twist", "heading_degrees": 180}]``.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ _MAX_SECONDS = 3600.0
 _NAMES = ", ".join(MOTIONS)
 _GESTURES = tuple(name for name, kind in MOTIONS.items() if kind.gesture is not None)
 _AT = Value("at", 0.0, 0.0, 60.0, "seconds")
-"""Start of a gesture on top of a motion."""
+"""Parameter of a gesture on top of a motion: its start after the start of the motion, s."""
 _BEATS_FILE = "file of beats"
-"""Key of the file of beats among the default values of a script."""
+"""Key of the path of the file of beats in the default values of a script."""
 
 
 @dataclass(frozen=True)
 class Script:
-    """Sequence of motions; ``+`` appends another one."""
+    """Sequence of motions; ``+`` appends another sequence."""
 
     requests: tuple[MotionRequest, ...]
 
@@ -52,7 +52,7 @@ class Script:
 
     @property
     def name(self) -> str:
-        """Name of its motions, or "motions" if they differ."""
+        """Common name of the motions, or "motions" if their names differ."""
         names = {request.name for request in self.requests}
         return names.pop() if len(names) == 1 else "motions"
 
@@ -67,7 +67,7 @@ class Script:
         return round(frames * max(1.0, height**0.5))
 
     def style(self, text: str | None) -> Style:
-        """Return the style of its jumps from ``text`` (see ``read_style``), the default style if it is None.
+        """Return the style of the script's jumps from ``text`` (``read_style``); None uses the default style.
 
         Raises:
             UserError: for an invalid text, and if no motion jumps.
@@ -83,8 +83,8 @@ class Script:
         return [part for request in self.requests for part in tasks_of_request(request, height)]
 
     def retake(self, number: int) -> tuple[Script, str] | None:
-        """Return the script for a retake after a fall in the motion with this ``number`` (0, 1, ...), and what is
-        changed, for messages; None if that motion has no gentler form."""
+        """Return the script for a retake after a fall in motion ``number``, from 0, and a description of the change for
+        messages; None if the motion has no gentler form."""
         ends = np.cumsum([request.repeat for request in self.requests])
         index = int(np.searchsorted(ends, number, side="right"))
         request = self.requests[index]
@@ -112,8 +112,8 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
             of text, or the path of a JSON file.
         beats: beats of dances without their own: a tempo such as ``90``, optionally followed by the time of the first
             beat in seconds, or the path of a file.
-        values: default values by name, lengths in body heights, for motions that have the parameter and do not set it;
-            None values are ignored.
+        values: default values by name, lengths in body heights, for motions that have this parameter and do not set it;
+            None sets no default.
 
     Raises:
         UserError: for the first mistake.
@@ -140,8 +140,8 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
 
 
 def drive_script(*steps: tuple[float, Drive]) -> Script:
-    """Return a script of ``Drive`` commands. Each step is a time in seconds from the start and the command that is
-    valid from then on; the last command is zero.
+    """Return a script of ``Drive`` commands. Each element of ``steps`` is a time in seconds from the start and the
+    command that is valid from then on; the last command is zero.
 
     Raises:
         ArgumentError: for times that do not increase, and for a last command that is not zero.
@@ -163,14 +163,14 @@ def own_script(name: str, begin: MotionFactory, *, seconds: float) -> Script:
     """Return a script of one motion of your own class.
 
     Args:
-        name: name of the motion in reports and of the video file; not that of a built-in motion.
+        name: name of the motion in reports, and of the video file; it must differ from the names of built-in motions.
         begin: function that returns the motion of a body from its stance; the motion has the attributes of
             ``BodyMotion``.
         seconds: time limit for a body of 1 m, s; the motion is cut off after it.
 
     Raises:
-        ArgumentError: for a name that is taken or unsuitable for a file, and for a time limit that is not positive or
-            too long.
+        ArgumentError: for a name that exists or is unsuitable for a file, and for a time limit that is not positive or
+            is too long.
     """
     if not re.fullmatch(r"[\w -]{1,60}", name) or name in MOTIONS:
         raise ArgumentError(

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 _MIN_ROLL_ANGLE = 30.0
-"""Tilt of the up axis of a ball, in degrees, from which on it has rolled; with less, it has turned about the up
-axis."""
+"""Tilt of the up axis of a ball, in degrees, above which the ball has rolled; with less, it has only turned about the
+up axis."""
 REMAINING_TIME_FRACTION = 0.03
 """Estimated remaining time of a motion that takes longer than expected, as a fraction of the elapsed time."""
 
@@ -42,7 +42,7 @@ class Stance:
     ground: GroundFrame
     """Ground frame: its origin is under the centre of mass, and up is against gravity."""
     standing: np.ndarray
-    """(N, 3) m, nodes."""
+    """(N, 3) m, positions of the nodes."""
     contact_points: np.ndarray
     """(k, 3) m, points of the body on the ground."""
     step: float
@@ -52,7 +52,7 @@ class Stance:
     friction: float = 0.8
     """Coulomb coefficient."""
     limbs: Limbs | None = None
-    """Limbs of the capture; None uses those of the cage."""
+    """Limbs of the capture; None uses the limbs of the cage."""
     style: Style = field(default_factory=Style)
     """Style of jumps."""
 
@@ -91,8 +91,8 @@ class Stance:
         return replace(self, ground=under, standing=positions.copy(), contact_points=touching)
 
     def moved_to(self, positions: np.ndarray) -> Stance:
-        """Return the same stance, rotated about the up axis and moved to the feet of the nodes at ``positions`` (N,
-        3)."""
+        """Return the same stance, rotated about the up axis and moved so that its feet match the feet of a body with
+        nodes at ``positions`` (N, 3)."""
         share = sole_shares(self.body, self.ground, self.standing)
         angle = heading_between(self.standing, positions, share, self.ground)
         feet, moved = share @ self.standing, share @ positions
@@ -107,15 +107,15 @@ class Stance:
         )
 
     def surface_height_above(self, point: np.ndarray) -> float:
-        """Return the signed distance in metres from ``point`` (3,) up to the highest surface above or below it; 0
-        without a surface."""
+        """Return the height in metres, relative to ``point`` (3,), of the highest surface on the vertical line through
+        it; 0 without a surface."""
         rise = surface_above(self.solids, point, self.ground.axes[2])
         return rise if np.isfinite(rise) else 0.0
 
     def landing(self, target: JumpTarget) -> JumpTarget:
-        """Return ``target`` with the rise of the surface ahead of the feet. The jump clears it by at least half of the
-        requested height. The target is unchanged if there is no surface, or if it is higher than the jump, such as a
-        wall or a lintel."""
+        """Return ``target`` with the rise of the surface on which the feet will land. The jump clears the surface by at
+        least half of the requested height. The target is unchanged without a surface, or if the surface is higher than
+        the jump, such as a wall or a lintel."""
         feet, up = sole_shares(self.body, self.ground, self.standing) @ self.standing, self.ground.axes[2]
         ahead = surface_above(self.solids, feet + target.distance * self.ground.axes[0], up)
         rise = ahead - surface_above(self.solids, feet, up)
@@ -140,12 +140,12 @@ class BodyMotion(Protocol):
 
     @property
     def expected_time(self) -> float:
-        """Expected seconds from the first time step until the body is at rest."""
+        """Expected time in seconds from the first time step until the body is at rest."""
         ...
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         ...
 
     def plan_record(self) -> DataclassInstance:
@@ -158,8 +158,8 @@ class BodyMotion(Protocol):
         ...
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> DataclassInstance | None:
-        """Return quantities of this motion beyond those measured for all motions; ``first`` and ``last`` are indices
-        into ``trajectory.time``."""
+        """Return measured quantities that only this motion has, between the states ``first`` and ``last`` of the
+        ``trajectory``; None if there are none."""
         ...
 
     def notes(self) -> list[str]:
@@ -169,7 +169,7 @@ class BodyMotion(Protocol):
 
 @dataclass
 class MotionRecord:
-    """Started motion of a sequence."""
+    """Record of a started motion of a sequence."""
 
     name: str
     asked: Mapping[str, float]
@@ -183,7 +183,7 @@ class MotionRecord:
 
 @dataclass(frozen=True)
 class MotionTask:
-    """Planned motion of a sequence."""
+    """Motion of a sequence that is created when it starts."""
 
     name: str
     asked: Mapping[str, float]
@@ -199,7 +199,7 @@ class MotionSequence:
         self._count = len(self._parts)
         self.done: list[MotionRecord] = []
         self._is_dropped = self._gets_up_next = False
-        """True if a fall has ended the current motion; True if getting up is the next motion."""
+        """Two flags: a fall has ended the current motion; getting up is the next motion."""
 
     @property
     def is_finished(self) -> bool:
@@ -230,8 +230,8 @@ class MotionSequence:
         return self.done[-1].motion.objectives(state, report, dt)
 
     def time_left(self, time: float, expected: Sequence[float]) -> float:
-        """Estimate the seconds from ``time`` until the last motion is at rest; ``expected`` are the durations of all
-        motions, s."""
+        """Estimate the time in seconds from ``time`` s until the body is at rest after the last motion; ``expected``
+        are the durations of all motions, s."""
         to_come = len(self._parts) - self._gets_up_next
         later = sum(expected[len(expected) - to_come :])
         if not self.done or self._resting:
@@ -253,12 +253,12 @@ class MotionSequence:
         return [f"{len(self._parts)} of {self._count} motions did not begin: {names}"]
 
     def spans(self, time: np.ndarray) -> list[tuple[int, int]]:
-        """Return the first and last index into ``time`` (F+1,) of each started motion."""
+        """Return the first and last index of each started motion in the array ``time`` (F + 1,), s."""
         return spans_of(self.done, time)
 
 
 def spans_of(done: Sequence[MotionRecord], time: np.ndarray) -> list[tuple[int, int]]:
-    """Return the first and last index into ``time`` (F+1,) of each motion of ``done``; each lasts until the next one
-    starts."""
+    """Return the first and last index of each motion of ``done`` in the array ``time`` (F + 1,), s; a motion lasts
+    until the next one starts."""
     starts = [int(np.searchsorted(time, entry.start_time - 1e-9)) for entry in done]
     return list(zip(starts, [*starts, len(time) - 1][1:], strict=True))

@@ -1,4 +1,4 @@
-"""Skip: small jumps in quick succession, each turned to the other side (docs/motions/gestures.md)."""
+"""Skip: small jumps in quick succession, turned to the left and right in alternation (docs/motions/gestures.md)."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _MAX_LENGTH = 0.3
 _TURN = np.radians(12.0)
 """Angle in radians by which the body is turned to either side of its direction."""
 _MIN_CONTACT_TIME, _MAX_MARGIN = 0.3, 0.5
-"""A landed body jumps again after the first, in sqrt(H / g), if its capture point is nearer to the middle of its feet
-than the second, relative to their edge."""
+"""Conditions for the next jump of a landed body: minimum time since the landing, in sqrt(H / g), and maximum distance
+of the capture point from the middle of the feet, relative to the distance of their edge."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +32,15 @@ class SkipPlan:
 
     jumps: float
     length: float
-    """Length of one jump."""
+    """Length of one jump, m."""
     height: float
-    """Height of one jump."""
+    """Height of one jump, m."""
     turn_degrees: float
     """Angle by which the body is turned to either side."""
 
 
 class Skip:
-    """Jump ahead in short, low jumps; each starts as soon as the body is balanced after the previous one."""
+    """Move ahead in short, low jumps; each starts as soon as the body is balanced after the previous one."""
 
     def __init__(self, stance: Stance, distance: float, height: float) -> None:
         """Create the motion of the body that stands at ``stance``.
@@ -88,8 +88,8 @@ class Skip:
         return [note for jump in self.jumps for note in jump.notes()]
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         jump = self.jumps[-1]
         result = jump.objectives(state, report, dt)
         if jump.phase not in (JumpPhase.LAND, JumpPhase.REST):
@@ -111,7 +111,7 @@ class Skip:
         return state.time - self._landed >= _MIN_CONTACT_TIME * self._time_unit and margin <= _MAX_MARGIN
 
     def _next(self, stance: Stance, positions: np.ndarray, number: int) -> Jump:
-        """Return jump ``number``, counted from 1, from ``stance``, with the nodes at ``positions`` (N, 3)."""
+        """Return jump ``number``, counted from 1, of the body at ``stance`` with nodes at ``positions`` (N, 3)."""
         start = self._start
         goal = self._share @ start.standing + number * self._length * start.ground.axes[0]
         offset = goal - self._share @ positions

@@ -1,4 +1,4 @@
-"""Measurement of a body, ground frames, rest detection, and the balance controller with its family of poses."""
+"""Measurement of a body, ground frames, detection of rest, and the balance controller with its family of poses."""
 
 from __future__ import annotations
 
@@ -24,34 +24,35 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.support import SupportPolygon
 
 SHEAR_BASIS = np.einsum("ki,j->kij", np.eye(3)[:2], np.eye(3)[2])
-"""(2, 3, 3) change of a sheared pose per unit of lean forward and to the left."""
+"""(2, 3, 3) derivatives of a sheared pose with respect to lean forward and to the left."""
 _PIN_STIFFNESS = 1e6
 """Stiffness that pins a node, relative to the largest entry of the stiffness matrix."""
 SOLE_HEIGHT = 0.06
-"""Height in body heights above a standing body's lowest node up to which its nodes form the sole."""
+"""Height of the sole above the lowest node of a standing body, body heights."""
 REST_SPEED = 0.03
-"""Speed of the centre of mass, in sqrt(g H), below which a standing body counts as slow."""
+"""Speed of the centre of mass, in sqrt(g H), below which a standing body is considered slow."""
 REST_TIME = 0.3
-"""Time in sqrt(H / g) for which a body is slow before it is at rest."""
+"""Time in sqrt(H / g) for which a body must be slow to be at rest."""
 SUPPORT_MARGIN = 0.95
 """Fraction of the footprint within which the centre of pressure stays."""
 _MIN_FOOTPRINT = 0.01
 """Half width in body heights of the square about the centre of mass that every footprint contains."""
 _PUSH_REACH = 0.04
-"""Half width in body heights of the square about the centre of mass in which the centre of pressure may always lie."""
+"""Half width, in body heights, of the square about the centre of mass in which the centre of pressure may always lie,
+even outside the footprint."""
 _BALANCE_PRIORITY_MARGINS = (0.25, 0.5)
-"""Capture margins (``BalanceController.capture_margin``) at which balance starts to have priority over uprighting, and
-at which it has full priority."""
+"""Capture margins (``BalanceController.capture_margin``) between which the priority of balance over uprighting grows
+from 0 to 1."""
 _SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 FRICTION_FRACTION = 0.95
-"""Fraction of the friction cone that objectives may use; with more, feet slide and other objectives fall short."""
+"""Fraction of the friction cone that objectives may use; with more, feet slide and other objectives are not reached."""
 
 
 @dataclass(frozen=True)
 class Weights:
     """Weights of a motion's objectives; speeds are measured in units of sqrt(g H).
 
-    Contact forces follow the plan, so objectives are met. Balance has priority over effort.
+    They are large compared to the weight of muscle effort, so that balance has priority over effort.
     """
 
     com: float = 600.0
@@ -61,8 +62,8 @@ class Weights:
     spin: float = 600.0
     pose: float = 0.02
     landing: float = 0.1
-    """Fraction of ``com``, ``up`` and ``spin`` that applies from touch-down on, when the body only has to come to rest,
-    at no given time. The same fraction of ``com`` applies while the body follows key frames."""
+    """Factor on ``com``, ``up`` and ``spin`` after touch-down, when the body has to come to rest but at no prescribed
+    time. The same factor applies to ``com`` while the body follows key frames."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class Measurement:
     velocity: np.ndarray
     """(3,) m/s, velocity of the centre of mass."""
     foot_centre: np.ndarray
-    """(2,) m, centre of the feet (nodes near the sole at rest)."""
+    """(2,) m, centre of the feet: the nodes that are near the ground at rest."""
     sole_height: float
     """Height of the lowest contact point above the ground, m."""
     in_contact: bool
@@ -86,14 +87,14 @@ class Measurement:
     support: SupportPolygon
     """Hull of the points in contact, ground coordinates."""
     angular_velocity_term: np.ndarray
-    """(2,) m/s, contribution of the spin to the angular momentum about the feet, as an equivalent velocity of the
-    centre of mass along the ground."""
+    """(2,) m/s, contribution of the spin to the angular momentum about the feet, expressed as a velocity of the centre
+    of mass along the ground."""
     rotation: np.ndarray
     """(3, 3) best-fit rotation from the standing pose, world axes."""
     angular_momentum: np.ndarray
-    """(3,) kg m^2/s about the centre of mass, world axes."""
+    """(3,) kg m^2/s, angular momentum about the centre of mass, world axes."""
     inertia: np.ndarray
-    """(3, 3) kg m^2 about the centre of mass, world axes."""
+    """(3, 3) kg m^2, inertia tensor about the centre of mass, world axes."""
 
 
 @dataclass(frozen=True)
@@ -101,11 +102,11 @@ class GroundFrame:
     """Right-handed frame on a plane; the rows of ``axes`` are forward, left and up."""
 
     axes: np.ndarray
-    """(3, 3) unit rows."""
+    """(3, 3) unit vectors forward, left and up, as rows."""
     origin: np.ndarray
-    """(3,) m, on the plane."""
+    """(3,) m, origin on the plane."""
     surface_normal: np.ndarray
-    """(3,) unit normal of the plane; differs from up on a slope."""
+    """(3,) unit normal of the plane, which differs from up on a slope."""
 
     @classmethod
     def on_plane(
@@ -116,8 +117,8 @@ class GroundFrame:
         Args:
             plane: the ground.
             forward: (3,) forward direction; it is projected onto the horizontal plane.
-            below: (3,) m, point above the origin of the frame.
-            up: (3,) unit, against gravity; None uses the normal of the plane.
+            below: (3,) m, point below which the origin of the frame is placed.
+            up: (3,) unit vector opposite to gravity; None uses the normal of the plane.
         """
         vertical = plane.normal if up is None else up
         flat = forward - (forward @ vertical) * vertical
@@ -152,7 +153,7 @@ class RestDetector:
 
         Args:
             velocity: (3,) m/s, velocity of the centre of mass.
-            time: s.
+            time: current time, s.
 
         Returns:
             True if the body is at rest.
@@ -165,8 +166,8 @@ class RestDetector:
 
 
 class BalanceController:
-    """Balance controller with affine poses of the rest shape: stretch along the up axis, bulging across it, and shear
-    by the lean.
+    """Balance controller whose target poses are affine maps of the rest shape: stretch along the up axis, bulging
+    across it, and shear by the lean.
 
     See docs/concepts/motions.md.
     """
@@ -197,21 +198,21 @@ class BalanceController:
                 "body: no point of the body is on the ground at the start; check the ground", check=("plane", "up")
             )
         footprint = ground.local(contact_points)[:, :2] - body.centre_of_mass(local)[:2]
-        # The centre of mass of a body that stands lies in its footprint, even if few points are in contact.
+        # The centre of mass of a standing body lies in its footprint, even if few points are in contact.
         self.footprint = SupportPolygon.hull(np.concatenate([footprint, _MIN_FOOTPRINT * body.height * _SQUARE]))
         """Hull of the contact points at rest, relative to the centre of mass."""
         self.gesture_turn = np.zeros(3)
-        """(3,) rotation vector of the body that is due to gestures of its parts, radians, ground axes; the measured
-        rotation does not contain it."""
+        """(3,) rotation vector of the body that is caused by gestures of its parts, radians, ground axes; it is
+        excluded from the measured rotation."""
 
     def balance_targets(
         self, measurement: Measurement, velocity: np.ndarray, spin: np.ndarray, dt: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Project the requested velocities onto those that the feet can produce without tipping or slipping.
+        """Project the requested velocities onto the set that the feet can produce without tipping or slipping.
 
-        The angular momentum about the feet, m h (v + angular_velocity_term), changes at a rate of the weight times the
-        horizontal distance from the centre of pressure to the centre of mass. Keeping the centre of pressure in the
-        footprint bounds the sum of both terms; friction bounds the first.
+        The rate of change of the angular momentum about the feet, m h (v + angular_velocity_term), is the weight times
+        the horizontal distance from the centre of pressure to the centre of mass. The sum of both terms is bounded
+        because the centre of pressure must stay in the footprint; the first term is bounded by friction.
 
         Args:
             measurement: measured body.
@@ -220,7 +221,7 @@ class BalanceController:
             dt: time step, s.
 
         Returns:
-            Velocity (3,) and spin (3,) at the end of the step.
+            Velocity (3,) in m/s and spin (3,) in rad/s at the end of the step.
         """
         gravity = float(np.linalg.norm(self.body.gravity))
         up = max(gravity + (velocity[2] - measurement.velocity[2]) / dt, 0.2 * gravity)
@@ -236,17 +237,17 @@ class BalanceController:
 
         level = within_grip(level)
         pressure = measurement.com[:2] - height / up * (level + turn) / dt
-        # Never request a fall: a small push in any direction stays allowed even with the centre of mass beyond the
-        # edge.
+        # Allow a small push in any direction even if the centre of mass is beyond the edge, so that the targets never
+        # request a fall.
         slack = measurement.com[:2] + _PUSH_REACH * self.body.height * _SQUARE
         allowed = SupportPolygon.hull(np.concatenate([measurement.support.scaled(SUPPORT_MARGIN).corners, slack]))
         both = (measurement.com[:2] - allowed.nearest(pressure)) * up / height * dt
-        # Both terms are reduced according to the weights of their objectives, speeds directly, spins with the radius of
-        # gyration. The part of the speed that exceeds the friction limit is assigned to the spin.
+        # Reduce both terms in proportion to the costs of their objectives; the radius of gyration relates spins to
+        # speeds. The part of the speed that exceeds the friction limit is assigned to the spin.
         share = 1.0 / (1.0 + 0.5 * np.trace(measurement.inertia) / (self.body.mass * height**2))
         shared = level + share * (both - level - turn)
-        # Uprighting must not drive the centre of mass away from the feet: where the capture point is far out, the body
-        # moves outward no faster than it would without uprighting.
+        # Uprighting must not drive the centre of mass away from the feet. If the capture point is far out, the body
+        # must not move outward faster than it would without uprighting.
         away = self._capture(measurement) - measurement.support.middle
         away /= max(float(np.linalg.norm(away)), 1e-12)
         excess = max(float(away @ shared) - float(max(away @ level, away @ both)), 0.0)
@@ -261,14 +262,14 @@ class BalanceController:
         )
 
     def capture_acceleration(self, measurement: Measurement, goal: np.ndarray) -> np.ndarray:
-        """Return the acceleration (2,) in m/s^2 along the ground that brings a body that falls like a pendulum to rest
-        over ``goal`` (2,). It steers the capture point, computed from the momentum about the feet, to the goal."""
+        """Return the acceleration (2,) in m/s^2 along the ground that brings an inverted pendulum to rest over ``goal``
+        (2,). It steers the capture point, computed from the angular momentum about the feet, to the goal."""
         pendulum = self._pendulum_rate2(measurement)
         return -2.0 * pendulum * (self._capture(measurement) - goal) + pendulum * (measurement.com[:2] - goal)
 
     def capture_margin(self, measurement: Measurement) -> float:
-        """Return the distance of the capture point from the middle of the support, relative to the distance of its
-        edge. Beyond 1, the body falls unless it steps."""
+        """Return the distance of the capture point from the middle of the support, relative to the distance of the edge
+        in the same direction. Beyond 1, the body falls unless it steps."""
         return measurement.support.relative_distance(self._capture(measurement), 1e-3 * self.body.height)
 
     def _balance_priority(self, measurement: Measurement) -> float:
@@ -300,7 +301,7 @@ class BalanceController:
         return (self._sole_share @ local)[:2]
 
     def measure(self, state: BodyState, report: StepReport | None) -> Measurement:
-        """Measure the body; ``report`` is that of the previous time step."""
+        """Measure the body; ``report`` is the report of the previous time step."""
         local = self.ground.local(state.positions)
         forces = report.forces[:, 0].sum() if report is not None else self.body.weight
         rotation = self._rotation(state.positions)
@@ -323,7 +324,7 @@ class BalanceController:
         )
 
     def _support(self, local: np.ndarray, report: StepReport | None) -> SupportPolygon:
-        """Return ``Measurement.support``; the whole footprint without contacts."""
+        """Return ``Measurement.support``; without contacts, the footprint at rest."""
         if report is None or report.contacts.count == 0:
             return self.footprint.moved(self._base(local) - self.base_offset)
         contacts = report.contacts
@@ -337,22 +338,22 @@ class BalanceController:
         return Rotation.from_rotvec(-self.gesture_turn @ self.ground.axes).as_matrix() @ turn
 
     def sole_heading(self, positions: np.ndarray) -> float:
-        """Return the angle in radians about the up axis by which the feet alone are rotated from the standing pose."""
+        """Return the rotation of the feet about the up axis relative to the standing pose, radians."""
         return heading_between(self.arms, positions, self._sole_share, self.ground)
 
     def over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
-        """Return the pose (3, 3) with its sole flat at ``base`` (2,) and the centre of mass at ``com`` (3,), ground
-        coordinates: sheared by the lean between them."""
+        """Return the pose (3, 3) with a flat sole at ``base`` (2,) and the centre of mass at ``com`` (3,), ground
+        coordinates: the body is sheared by the lean between both."""
         return self._leaning(com, base, heading, SHEAR_BASIS)
 
     def bent_over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
-        """Return the pose (3, 3) of ``over_base`` for a body that leans by bending, with the rotation that strains it
-        least."""
+        """Return the pose (3, 3) for the arguments of ``over_base`` in which the body leans by bending, with the
+        rotation that minimizes its strain."""
         return self._leaning(com, base, heading, self._bending)
 
     def _leaning(self, com: np.ndarray, base: np.ndarray, heading: float, leans: np.ndarray) -> np.ndarray:
-        """Return the pose (3, 3), world axes: stretch along the up axis, bulging that cancels half of the volume
-        change, ``leans`` (2, 3, 3) per unit of lean, then a rotation by ``heading`` radians."""
+        """Return the pose (3, 3), world axes: stretch along the up axis; bulging, which cancels half of the volume
+        change; lean, with the derivatives ``leans`` (2, 3, 3); and a rotation by ``heading`` radians."""
         turn = Rotation.from_rotvec([0.0, 0.0, heading]).as_matrix()
         lean = (com[:2] - base + turn[:2, :2] @ self.base_offset) / self.standing_height
         lean = lean * min(1.0, 0.5 / max(float(np.linalg.norm(lean)), 1e-9))
@@ -363,8 +364,9 @@ class BalanceController:
 
     @cached_property
     def _bending(self) -> np.ndarray:
-        """(2, 3, 3) change of the pose per unit of lean forward and to the left, ground axes, for a body with a fixed
-        sole that a horizontal body force bends: the affine map nearest to its small displacements, weighted by mass."""
+        """(2, 3, 3) derivatives of the pose with respect to lean forward and to the left, ground axes, for a body with
+        a fixed sole that a horizontal body force bends: the mass-weighted least-squares affine fit of its small
+        displacements."""
         body, assembly, axes = self.body, self.body.assembly, self.ground.axes
         entries = assembly.hessian_entries(self._standing, projected=True)
         is_fixed = np.repeat(self._sole_share > 0.0, 3)
@@ -452,8 +454,8 @@ def _share_in_cone(push: np.ndarray, load: np.ndarray, normal: np.ndarray, frict
 
 
 def sole_shares(body: SoftBody, ground: GroundFrame, standing: np.ndarray) -> np.ndarray:
-    """Return weights (N,) with sum 1 whose weighted mean of the nodes is the centre of the feet: the masses of the
-    nodes near the ground at rest."""
+    """Return weights (N,) with sum 1, proportional to the masses of the nodes near the ground at rest: the mean of all
+    nodes with these weights is the centre of the feet."""
     heights = standing @ ground.surface_normal
     mass = body.node_mass * (heights < heights.min() + SOLE_HEIGHT * body.height)
     return mass / mass.sum()

@@ -1,4 +1,4 @@
-"""Stand upright over the feet: for a given time, or between two motions."""
+"""Standing upright over the feet, for a given time or between two motions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class PostureTarget:
     acceleration: np.ndarray
     """(3,) m/s^2, rate of ``velocity``."""
     turn: np.ndarray
-    """(3,) rotation vector of the body as a whole, radians."""
+    """(3,) rotation vector of the whole body, radians."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class StandOutcome:
 
 
 class Stand:
-    """Balance over the feet where they are, for example after a jump, for any length of time."""
+    """Balance over the current position of the feet, for example after a jump, for any length of time."""
 
     def __init__(self, stance: Stance, *, at_rest: bool = True, crouch: float = 1.0) -> None:
         """Create the motion of the body that stands at ``stance``.
@@ -68,7 +68,7 @@ class Stand:
         self._time_unit = float(np.sqrt(stance.body.height / self._gravity))
         self._height = crouch * self.controller.standing_height
         self.posture: PostureTarget | None = None
-        """Posture of the next time step; None is upright."""
+        """Posture of the next time step; None for the upright posture."""
         self._rest_detector = RestDetector(stance.body)
         self._is_resting = at_rest
 
@@ -82,8 +82,8 @@ class Stand:
         return []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         measurement = self.controller.measure(state, report)
         slow = bool(np.linalg.norm(measurement.velocity) <= REST_SPEED * np.sqrt(self._gravity * self.body.height))
         self._is_resting = self._rest_detector.update(measurement.velocity, state.time) or (self._is_resting and slow)
@@ -94,7 +94,7 @@ class Stand:
         acceleration = rate**2 * (goal - measurement.com) - 2.0 * rate * measurement.velocity
         acceleration[:2] = self.controller.capture_acceleration(measurement, goal[:2])
         if posture is not None:
-            # Feed-forward: the errors of both laws are relative to the moving goal.
+            # Feed-forward terms: the errors of both control laws are relative to the moving goal.
             rates = np.array([*np.full(2, np.sqrt(self._gravity / self.controller.standing_height)), rate])
             acceleration += posture.acceleration + 2.0 * rates * posture.velocity
         acceleration[2] = max(acceleration[2], -0.8 * self._gravity)
@@ -119,7 +119,7 @@ class Stand:
 
 
 class StandFor:
-    """Stand for ``seconds`` seconds, and then until the body is at rest."""
+    """Stand for ``seconds`` s, and then until the body is at rest."""
 
     def __init__(self, stance: Stance, seconds: float) -> None:
         self.seconds, self._stand, self._stance = seconds, Stand(stance), stance
@@ -128,7 +128,7 @@ class StandFor:
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the time is over and the body is at rest."""
+        """True if the time has passed and the body is at rest."""
         return self._is_over and self._stand.is_at_rest
 
     @property
@@ -161,8 +161,8 @@ class StandFor:
         return []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         self._started = state.time if self._started is None else self._started
         self._is_over = state.time - self._started >= self.seconds - 1e-9
         return self._stand.objectives(state, report, dt)

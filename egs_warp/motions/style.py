@@ -1,4 +1,4 @@
-"""Style of a jump: factors that animators use; 1 is the default of egs_warp (docs/motions/style.md)."""
+"""Style of a jump: factors for the principles of animation, 1 by default (docs/motions/style.md)."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from egs_warp.errors import ArgumentError, did_you_mean
 from egs_warp.motions.values import Value
 
 MIN_FACTOR, MAX_FACTOR = 0.5, 2.0
-"""Smallest and largest factor; outside this range no body could make the stroke of the jump."""
+"""Minimum and maximum of a factor; outside this range, no body could perform the stroke of the jump."""
 MAX_OVERLAP = 0.5
-"""Largest overlap; the tip of a part that sags by half of its length swings as far as the part is long."""
+"""Maximum overlap, at which the tip of a part sags by half of its length and swings by its whole length."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,12 @@ class Style:
     squash: float = 1.0
     """Time in which the fall is stopped on landing, which determines the compression."""
     bounce: float = 1.0
-    """Swing of the body about its standing height after the landing: the damping ratio is 1 / bounce^2."""
+    """Oscillation of the body about its standing height after the landing: the damping ratio is 1 / bounce^2."""
     timing: float = 1.0
     """Duration of crouch and thrust: below 1 they are quick and hard."""
     overlap: float = 0.0
-    """Softness of the parts that stick out of the body (``CreatureOptions.overlap``); no factor. It is a property of
-    the body, so a motion in this style does not change it."""
+    """Softness of the parts that stick out of the body (``CreatureOptions.overlap``); not a factor. It is a property of
+    the body, so the style of a single motion does not change it."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -43,12 +43,12 @@ class Style:
                 raise ArgumentError(name, f"give a number from {low:g} to {high:g}", value=value)
 
     def scaled(self, factors: Mapping[str, float]) -> Style:
-        """Return the style with its numbers multiplied by ``factors``, within the bounds."""
+        """Return the style with its factors multiplied by ``factors``, within the bounds."""
         scaled = {name: value * factors.get(name, 1.0) for name, value in vars(self).items()}
         return Style(**{name: float(np.clip(value, *span(name))) for name, value in scaled.items()})
 
     def __str__(self) -> str:
-        """Return the text that ``read_style`` reads: a preset's name, or all numbers."""
+        """Return the text for ``read_style``: the name of a preset, or all factors."""
         values = vars(self)
         same = [name for name, preset in PRESETS.items() if preset == values]
         numbers = [f"{name}={value!r}" for name, value in values.items() if value or name != "overlap"]
@@ -56,7 +56,7 @@ class Style:
 
 
 def span(name: str) -> tuple[float, float]:
-    """Return the smallest and the largest value of the number ``name`` of a style."""
+    """Return the minimum and maximum of the field ``name`` of a style."""
     return (0.0, MAX_OVERLAP) if name == "overlap" else (MIN_FACTOR, MAX_FACTOR)
 
 

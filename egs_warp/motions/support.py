@@ -9,22 +9,21 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 _LINE_TOLERANCE = 1e-6
-"""Largest ratio of width to length of collinear points."""
+"""Maximum ratio of width to length of points that are considered collinear."""
 _TOLERANCE = 1e-9
-"""Largest distance of a point outside a half plane, relative to the distances involved, at which it counts as inside.
-"""
+"""Maximum distance outside a half plane, relative to the distances involved, of a point that is considered inside."""
 
 
 @dataclass(frozen=True)
 class SupportPolygon:
-    """Convex polygon on the ground. It may be a segment or a point, whose width is zero."""
+    """Convex polygon on the ground. It may degenerate to a segment or a point."""
 
     corners: np.ndarray
-    """(k, 2) m, counterclockwise."""
+    """(k, 2) m, corners in counterclockwise order."""
     normals: np.ndarray
     """(m, 2) outward unit normals of the edges."""
     offsets: np.ndarray
-    """(m,) m; a point is inside if its product with each normal is at most the offset."""
+    """(m,) m, offsets of the edges: a point is inside if its dot product with each normal is at most the offset."""
 
     @classmethod
     def hull(cls, points: np.ndarray) -> SupportPolygon:
@@ -42,7 +41,7 @@ class SupportPolygon:
     def middle(self) -> np.ndarray:
         """(2,) m, centre of area; the mean of the corners of a polygon without area."""
         first, then = self.corners, np.roll(self.corners, -1, axis=0)
-        # Relative to a corner, so that no digits are lost far from the origin.
+        # Use coordinates relative to a corner, so that no digits are lost far from the origin.
         first, then = first - self.corners[0], then - self.corners[0]
         areas = first[:, 0] * then[:, 1] - first[:, 1] * then[:, 0]
         if areas.sum() <= 0.0:
@@ -68,8 +67,9 @@ class SupportPolygon:
         return inside if inside >= 0.0 else -float(np.linalg.norm(self.nearest(point) - point))
 
     def relative_distance(self, point: np.ndarray, min_distance: float) -> float:
-        """Return the distance of ``point`` (2,) from the middle, relative to that of the edge in the same direction: 0
-        in the middle, 1 on the edge. Edges nearer than ``min_distance`` m count as that far."""
+        """Return the distance of ``point`` (2,) from the middle, relative to the distance of the edge in the same
+        direction: 0 in the middle, 1 on the edge. The distance of an edge is assumed to be at least ``min_distance`` m.
+        """
         levels = self.normals @ self.middle
         return float(
             ((self.normals @ point - levels) / np.maximum(self.offsets - levels, min_distance)).max(initial=0.0)
@@ -86,12 +86,12 @@ class SupportPolygon:
 
 
 def nearest_in_half_planes(normals: np.ndarray, offsets: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Return the point (2,) nearest to ``point`` (2,) whose products with the unit ``normals`` (m, 2) are at most the
-    ``offsets`` (m,).
+    """Return the point (2,) nearest to ``point`` (2,) whose dot products with the unit ``normals`` (m, 2) are at most
+    the ``offsets`` (m,).
 
-    It is the point itself, its projection to one edge, or the intersection of two. If the half planes have no common
-    point, it is the candidate that is least outside. A point that is not finite, as in a step without a solution, is
-    returned as it is.
+    It is the point itself, its projection onto an edge, or the intersection of two edges. If the half planes have no
+    common point, it is the candidate that violates them least. A point that is not finite, as in a step without a
+    solution, is returned unchanged.
     """
     outside = normals @ point - offsets
     if not np.isfinite(point).all() or (outside <= 0.0).all():

@@ -16,13 +16,14 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.twist import AIRBORNE_FRACTION, twist
 
 HEADING_TOLERANCE = np.radians(8.0)
-"""Largest heading error in radians of a landing after which no further jump follows."""
+"""Maximum heading error in radians of a landing after which no further jump follows."""
 MAX_JUMPS = 5
 CORRECTION_RATE = 1.0 / 3.0
-"""Fraction of turns of the largest size that need another jump, because the landing misses by more than
+"""Fraction of the jumps with the largest turn that need another jump, because their heading error exceeds
 ``HEADING_TOLERANCE``."""
 PYRAMID_FRICTION_RATIO = 0.79
-"""Tangential force of a friction pyramid with four edges relative to Coulomb's cone, averaged over all directions."""
+"""Maximum tangential force of a friction pyramid with four edges relative to Coulomb's cone, averaged over all
+directions."""
 MAX_TURN_FRACTION = 0.8
 """Fraction of the largest possible turn that one jump requests."""
 
@@ -51,7 +52,7 @@ class Turn:
 
     @property
     def expected_time(self) -> float:
-        """Expected duration in seconds of the jumps so far and those for the remaining turn."""
+        """Expected duration in seconds of the jumps so far and of the jumps for the remaining turn."""
         before, at_once = len(self.jumps) - 1, self.max_turn_per_jump
         if self._remaining_after_jump is None:
             # A small turn, such as the correction of a landing, needs no correction itself.
@@ -63,8 +64,8 @@ class Turn:
         return float(min(count, MAX_JUMPS)) * self.jumps[0].expected_time
 
     def _chance_of_another(self, missing: float) -> float:
-        """Return the probability of another jump after a remaining turn of ``missing`` radians; in the air, the landing
-        is uncertain."""
+        """Return the probability of another jump if a turn of ``missing`` radians is predicted to remain. The
+        prediction is uncertain while the body is in the air."""
         if self.jumps[-1].phase is JumpPhase.FLIGHT:
             return min(missing / (2.0 * HEADING_TOLERANCE), 1.0)
         return float(missing > HEADING_TOLERANCE)
@@ -95,15 +96,15 @@ class Turn:
         return notes
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         result = self.jumps[-1].objectives(state, report, dt)
         jump = self.jumps[-1]
         self._remaining_after_jump = (
             self._remaining_turn - jump.facing.predicted_heading if jump.phase is JumpPhase.FLIGHT else None
         )
         if jump.phase in (JumpPhase.LAND, JumpPhase.REST):
-            # The frame of a landed jump is rotated by the requested turn, so the heading of its feet in it is the
+            # The frame of a landed jump is rotated by the requested turn, so the heading of the feet in it is the
             # error.
             self._remaining_after_jump = (
                 self._remaining_turn - jump.facing.target_heading - jump.controller.sole_heading(state.positions)
@@ -115,7 +116,8 @@ class Turn:
         return result
 
     def _next_turn(self) -> float:
-        """Return the turn in radians of one of the equal jumps that the remaining turn needs."""
+        """Return the turn in radians of the next jump; the remaining turn is divided equally among as few jumps as
+        possible."""
         return self._remaining_turn / float(np.ceil(abs(self._remaining_turn) / self.max_turn_per_jump))
 
     def _next_jump(self, state: BodyState) -> Jump:
@@ -130,15 +132,15 @@ class Turn:
 
 
 def largest_turn(jump: Jump, stance: Stance) -> float:
-    """Return the largest turn in radians that friction under the feet allows in one jump as planned
+    """Return the largest turn in radians that friction under the feet allows in the planned jump
     (docs/concepts/motions.md).
 
-    The friction impulse about the up axis is mu r_eff times the impulse of the normal forces, m (v_z + g t); r_eff is
-    the mean distance of the contact points from their middle.
+    The angular impulse of friction about the up axis is mu r_eff times the impulse of the normal forces, m (v_z + g t);
+    r_eff is the mean distance of the contact points from their middle.
     """
     plan, body, up = jump.plan, stance.body, stance.ground.axes[2]
     arms = (stance.contact_points - stance.contact_points.mean(axis=0)) @ stance.ground.axes[:2].T
-    # Points are denser at the rim of a sole; over a disc the mean distance is 2/3 of the radius.
+    # Points are denser at the rim of a sole, so limit the mean distance to the value of a disc, 2/3 of the radius.
     lever = min(float(np.linalg.norm(arms, axis=1).mean()), 2.0 / 3.0 * float(np.linalg.norm(arms, axis=1).max()))
     impulse = body.mass * (plan.speed_up + jump.gravity * plan.thrust_time)
     rate = PYRAMID_FRICTION_RATIO * stance.friction * lever * impulse / float(up @ body.inertia(stance.standing) @ up)

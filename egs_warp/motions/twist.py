@@ -1,4 +1,4 @@
-"""Twist: a jump that turns, its spin built by friction under the feet while the muscles thrust.
+"""Twist: a jump that turns; friction under the feet produces the spin during the thrust.
 
 See docs/concepts/motions.md.
 """
@@ -14,15 +14,15 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import BalanceController, Measurement
 
 AIRBORNE_FRACTION = 0.88
-"""Fraction of the planned flight time in which the body is off the ground: it stretches before take-off and before
-landing."""
+"""Fraction of the planned flight time in which the body is off the ground; it is below 1 because the body stretches
+before take-off and before landing."""
 SPIN_FACTOR = 1.15
-"""Factor on the spin of the thrust: muscles fall short of the objective, and the wide body in the air turns more
-slowly."""
+"""Factor on the spin of the thrust, because the muscles do not fully reach their objective, and the body is wider and
+turns more slowly in the air."""
 LANDING_SLIDE_ANGLE = np.radians(5.0)
 """Angle in radians by which the feet continue to slide while friction stops the spin on landing."""
 MAX_WIDTH = 1.15
-"""Largest width of the body in the air relative to standing; 1 / ``MAX_WIDTH`` is the smallest."""
+"""Maximum width of the body in the air relative to standing; the minimum is 1 / ``MAX_WIDTH``."""
 
 
 def twist(stance: Stance, target: JumpTarget, turn: float) -> Jump:
@@ -38,7 +38,7 @@ class TurnHeading:
         self._standing_inertia = stance.body.inertia(stance.standing)
 
     def update(self, heading: float) -> None:
-        """Update the heading without wrapping, so that full turns count."""
+        """Update the heading without wrapping, so that full turns are included."""
         self.heading += float(np.remainder(heading - self.heading + np.pi, 2.0 * np.pi) - np.pi)
 
     def thrust_momentum(
@@ -50,11 +50,11 @@ class TurnHeading:
         left: float,
         flight_time: float,
     ) -> np.ndarray:
-        """Return the angular momentum (3,) in kg m^2/s with which the body in the air turns upright and by the
+        """Return the angular momentum (3,) in kg m^2/s with which the body becomes upright in the air and turns by the
         remaining heading change.
 
-        In the air, the body has approximately its standing shape, so the standing inertia applies, not that of the
-        crouch.
+        In the air, the body has approximately its standing shape. Therefore the inertia of the standing body applies,
+        not the inertia of the crouched one.
         """
         up, rotation = controller.ground.axes[2], measurement.rotation
         inertia = rotation @ self._standing_inertia @ rotation.T
@@ -74,11 +74,13 @@ class TurnHeading:
         return pose @ (width * np.eye(3) + (1.0 - width) * np.outer(up, up))
 
     def landed_heading(self, controller: BalanceController, positions: np.ndarray) -> float:
-        """Return the heading of the feet: a missing turn is not corrected by a twisted stance."""
+        """Return the heading of the feet, because the landed body does not correct a missing turn by twisting over its
+        feet."""
         return controller.sole_heading(positions)
 
     def _remaining_turn(self) -> float:
-        """Return the remaining turn in radians until touch-down; the feet then continue to slide."""
+        """Return the remaining turn in radians until touch-down, after which the feet still slide by
+        ``LANDING_SLIDE_ANGLE``."""
         return (
             self.target_heading
             - np.sign(self.target_heading) * min(LANDING_SLIDE_ANGLE, abs(self.target_heading))

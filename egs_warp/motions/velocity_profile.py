@@ -1,4 +1,4 @@
-"""Velocity profile along a path: as fast as allowed, with constant acceleration and deceleration, slower at corners."""
+"""Velocity profile along a path: as fast as the limits of speed and acceleration allow, slower at corners."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 _SAMPLES = 8
-"""Samples per segment of the path."""
+"""Number of samples per segment of the path."""
 
 
 @dataclass(frozen=True)
@@ -15,19 +15,19 @@ class ProfileSample:
     """Target position, velocity and acceleration along the ground."""
 
     position: np.ndarray
-    """(2,) m."""
+    """(2,) m, position."""
     velocity: np.ndarray
-    """(2,) m/s."""
+    """(2,) m/s, velocity."""
     acceleration: np.ndarray
-    """(2,) m/s^2."""
+    """(2,) m/s^2, acceleration."""
 
 
 @dataclass(frozen=True)
 class VelocityProfile:
-    """Velocity profile over n points, from rest to rest; the position is constant before and after."""
+    """Velocity profile over n points that starts and ends at rest; the position is constant before and after."""
 
     points: np.ndarray
-    """(n, 2) m."""
+    """(n, 2) m, points of the path."""
     speeds: np.ndarray
     """(n,) m/s, speeds at the points; acceleration is constant between two points."""
     times: np.ndarray

@@ -39,15 +39,14 @@ from egs_warp.motions.walk_plan import WalkControl, WalkPhase, WalkPlan
 from egs_warp.motions.walk_posture import select_posture
 
 MIN_FOOT_LOAD = 0.01
-"""Share of the weight that a foot must carry to count as landed."""
+"""Share of the weight that a foot must carry to be considered landed."""
 MAX_LAG = 0.5
 """Mean lag of the feet, in steps, beyond which a step is repeated."""
 MIN_REAR_MARGIN, MAX_LEAD = 0.21, 0.04
-"""Smallest distance of the centre of mass of a walking body from the rear edge of its standing support, relative to its
-height above the ground, and largest distance in body heights by which the body leans forward to keep it (measured on
-the robot)."""
+"""Minimum distance of a walking body's centre of mass from the rear edge of its standing support, relative to the
+height of the centre of mass; and maximum lean forward that ensures it, in body heights (measured on the robot)."""
 MIN_STEP_LENGTH = 0.002
-"""Smallest step length in body heights."""
+"""Minimum step length in body heights."""
 _SHIFT_TIME, _GATHER_TIME, _REST_TIME = 1.5, 3.0, 1.0
 """Durations of the first and the last phase, and of standing afterwards, in sqrt(H / g)."""
 _PLAN_STEP, _PLANNED_PHASES = 1.0 / 12.0, 8
@@ -76,7 +75,7 @@ class Walk:
             route: route to follow.
             step_length: step length in metres; it is reduced to the longest step that the body can make.
             speed: relative to the nominal speed.
-            step_fraction: fraction of the longest and most turned steps that are used.
+            step_fraction: factor on the maximum length and maximum turn of the steps, at most 1.
             crouch: height of the centre of mass between the first and the last phase, relative to its standing height.
             control: weights and gains.
 
@@ -119,7 +118,7 @@ class Walk:
         self._step_limits = limits
         self._parts = [BodyPart.of(body, f"foot {index}", foot.sole) for index, foot in enumerate(feet)]
         self._near_points = [np.flatnonzero(foot_of_node(feet) == index) for index in range(len(feet))]
-        """Nodes that belong to each foot."""
+        """Indices (k,) of the nodes that belong to each foot."""
         self._rate = float(np.sqrt(self.gravity / self._start_com[2]))
         self.phase = WalkPhase.SHIFT
         self.with_gestures: Callable[[np.ndarray], np.ndarray] | None = None
@@ -129,7 +128,7 @@ class Walk:
         self._footprints = self._planner.start
         """(F, 4) foothold of each foot, the previous one while it swings, see ``motions.walk_posture``."""
         self.swinging: tuple[int, ...] = ()
-        """Feet that are being lifted, moved and set down."""
+        """Indices of the feet that are being lifted, moved and set down."""
         self._sidestep = np.zeros(2)
         """(2,) m, offset of the swinging feet from their nominal footholds to catch the body."""
         self._target_pressure: np.ndarray | None = None
@@ -137,11 +136,11 @@ class Walk:
         self._late_swings = self._repeated_steps = 0
         self._requested_steps = step_count
         self._arrived_footholds = [0] * len(feet)
-        """Step at whose planar pose each foot landed last."""
+        """Index of the step at whose planar pose each foot has landed last."""
 
     @property
     def expected_time(self) -> float:
-        """Expected duration in seconds, if all swings end in time."""
+        """Expected duration in seconds if all swings end in time."""
         gait = self.gait
         swings = gait.swings * (gait.swing_time + gait.double_time) - gait.double_time
         return self._duration(WalkPhase.SHIFT) + swings + self._duration(WalkPhase.GATHER)
@@ -192,8 +191,8 @@ class Walk:
         return footfalls(trajectory, self.feet, stride=self._stride(), first=first, last=last)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
-        previous step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
+        the previous step."""
         body, axes, control = self.body, self.ground.axes, self.control
         local = self.ground.local(state.positions)
         self._advance_phase(local, report, state.time)
@@ -249,8 +248,8 @@ class Walk:
             self._enter(WalkPhase.REST, time, local)
 
     def _plan_swing(self, swing: int, local: np.ndarray) -> None:
-        """Plan ``swing``, which starts with the nodes at ``local`` (N, 3): repeat a step that was lost because feet
-        slipped. A walk under commands (``motions.drive``) extends its route here."""
+        """Plan ``swing``, which starts with the nodes at ``local`` (N, 3): repeat a step if the feet lag too far
+        behind. A walk under commands (``motions.drive``) extends its route here."""
         if (
             self._repeated_steps < self._requested_steps
             and self._mean_lag(local) > MAX_LAG
@@ -274,7 +273,7 @@ class Walk:
         )
 
     def _nominal_footholds(self, steps: Sequence[int]) -> np.ndarray:
-        """Return the nominal position (F, 2) of each foot after its number of steps, ``steps``."""
+        """Return the nominal positions (F, 2) of the feet; ``steps`` is the index of the step of each foot."""
         planar_poses = [self.planar_poses[min(step, self.gait.step_count)] for step in steps]
         return np.array(
             [self._planner.nominal_foothold(planar_pose, foot)[:2] for foot, planar_pose in enumerate(planar_poses)]
@@ -283,7 +282,7 @@ class Walk:
     def _enter(self, phase: WalkPhase, time: float, local: np.ndarray) -> None:
         self.phase, self._entered = phase, time
         for foot in set(range(len(self.feet))) - set(self.swinging):
-            # The foot may have slid; this is where it stands now.
+            # The foot may have slid, so update its foothold to the current position.
             self._footprints[foot] = self._planner.landed_foothold(foot, local, float(self._footprints[foot, 3]))
         self._plan = self._planned_pendulum()
 
@@ -301,7 +300,7 @@ class Walk:
         }[phase]
 
     def _has_landed(self, index: int, local: np.ndarray) -> None:
-        """Record that foot ``index`` has landed where it is."""
+        """Record that foot ``index`` has landed at its current position."""
         self.swinging = tuple(foot for foot in self.swinging if foot != index)
         self._arrived_footholds[index] = self.gait.target_step(self.swing)
         planned = float(self.planar_poses[self._arrived_footholds[index]][2])
@@ -328,8 +327,8 @@ class Walk:
         return float(self._place_at(self._progress(self.phase, self.swing, elapsed))[2])
 
     def _planned_pendulum(self) -> PendulumPlan:
-        """Plan the pendulum from the start of this phase. During swings, the centre of pressure is as near to the
-        planned centre of mass as the feet allow; in between, it is interpolated."""
+        """Plan the pendulum from the start of the current phase. During swings, the centre of pressure is as near to
+        the planned centre of mass as the standing feet allow; between swings, it is interpolated."""
         step = _PLAN_STEP * self._time_unit
         phases = list(self._pressures(step))
         pieces = []
@@ -349,8 +348,8 @@ class Walk:
         return PendulumPlan.from_pressure(np.concatenate(pieces), step, self._rate)
 
     def _pressures(self, step: float) -> Iterator[tuple[WalkPhase, np.ndarray]]:
-        """Yield the current and future phases, each with the centre of pressure (n, 2) every ``step`` seconds that is
-        nearest to the planned centre of mass."""
+        """Yield the current and future phases, each with its centres of pressure (n, 2), one every ``step`` seconds.
+        During swings, these are the supported points nearest to the planned centre of mass."""
         footprints, phase, swing = self._footprints.copy(), self.phase, self.swing
         for _ in range(_PLANNED_PHASES):
             count = max(round(self._duration(phase) / step), 1)
@@ -396,8 +395,8 @@ class Walk:
     def _com_velocity(self, local: np.ndarray, velocity: np.ndarray, elapsed: float, dt: float) -> np.ndarray:
         """Return the target velocity (3,) in m/s of the centre of mass at the end of the time step.
 
-        A centre of pressure under the standing feet steers the divergent component of motion to its plan. The next
-        footprints compensate for the remaining error.
+        The centre of pressure under the standing feet steers the divergent component of motion to its plan. The next
+        footprints compensate the remaining error.
         """
         com = self.body.centre_of_mass(local)
         pressure, divergent = self._plan.at(elapsed)
@@ -439,7 +438,7 @@ class Walk:
             goal = self._planner.nominal_foothold(self.planar_poses[gait.target_step(self.swing)], index)
             goal[:3] += [*self._sidestep, self._slope @ self._sidestep]
             targets[index] += gait.transfer_progress(progress) * (goal - self._footprints[index])
-            # A foot without contact at the end of its swing reaches down.
+            # Lower a foot that has no contact at the end of its swing.
             targets[index, 2] += gait.foot_height(progress) - 0.02 * self.body.height * max(progress - 1.0, 0.0)
         return targets
 
@@ -448,7 +447,7 @@ class Walk:
     ) -> Objective:
         sole, part, control = self.feet[index].sole, self._parts[index], self.control
         now, then = (self._planner.sole(index, footholds[index]) for footholds in (before, after))
-        # A loaded sole is strained, and would drag if it were straightened in the first time step.
+        # A loaded sole is deformed, and would drag on the ground if it were straightened in the first time step.
         share = control.foot_share * self.gait.steering_progress(elapsed / self.gait.swing_time)
         velocity = (share * (now - local[sole]) + then - now) / dt
         return part_nodes(self.body, part, velocity @ self.ground.axes, self._posture.swing_weight)

@@ -29,14 +29,16 @@ class WalkPlan:
     double_time: float
     lift: float
     stride: float
-    """Largest distance between two consecutive footprints of one foot, m."""
+    """Maximum distance between two consecutive footprints of one foot, m."""
 
 
 @dataclass(frozen=True)
 class WalkControl:
-    """Weights of the objectives (speeds are measured in units of sqrt(g H)) and gains of the feedback. With weights ten
-    times as large, muscles do three times as much work, against each other; with a tenth of the weights, a box
-    falls."""
+    """Weights of the objectives, with speeds in units of sqrt(g H), and gains of the feedback.
+
+    With ten times the weights, the muscles do three times as much work, because they act against each other. With a
+    tenth of the weights, a box falls.
+    """
 
     spin: float = 60.0
     pose: float = 0.1
@@ -55,4 +57,4 @@ class WalkControl:
     planned_margin: float = 0.6
     """Fraction of each sole over which the plan places the centre of pressure."""
     sidestep: float = 5.5
-    """Rate in sqrt(g / H) at which a swinging foot's target moves to where it would catch the body."""
+    """Rate in sqrt(g / H) at which the target of a swinging foot moves to the position that catches the body."""

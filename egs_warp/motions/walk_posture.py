@@ -19,35 +19,36 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import SHEAR_BASIS
 
 MAX_STEP_PER_LEG = 0.5
-"""Longest step relative to the shortest leg's length."""
+"""Maximum step length relative to the length of the shortest leg."""
 MAX_SIDE_STEP = 0.5
-"""Longest sideways step of a body on legs relative to its longest step; a leg then reaches the next one at most."""
+"""Maximum length of a sideways step of a body on legs relative to a forward step; with a longer step, a leg could pass
+the next one."""
 MAX_TURN = float(np.radians(15.0))
-"""Largest turn of one step on legs, in radians."""
+"""Maximum turn of one step on legs, radians."""
 MAX_FOOT_LIFT = 0.03
 """Largest lift of a foot, in body heights."""
 LEGGED_TIMING, ROCKING_TIMING = GaitTiming(0.94, 0.78, 0.2, 0.6), GaitTiming(0.94, 0.55, 0.1, 0.75)
-"""Gait timing at nominal speed, on legs and on a single base. A body that pivots about its sides does so during most of
-a swing; the less time it stands on both sides, the less it sways from one to the other."""
+"""Gait timing at nominal speed, on legs and on a single base. On a single base, the body pivots during most of a swing;
+the shorter the double support, the less it sways between its sides."""
 MAX_PIVOT, MAX_ROLL = 0.45, 0.05
-"""Largest angles in radians by which a body on one base pivots about one side, and tips to lift the other. With larger
-angles it would throw itself off the side on which it stands."""
+"""Maximum angles in radians by which a body on a single base pivots about one side, and tips to lift the other side.
+With larger angles, it would lose its balance on the standing side."""
 COUNTER_ROTATION = 1.5
-"""Counter-rotation: reduction of the rotation of a node per body height above the base, relative to the rotation of the
-base. The less of the body rotates with the base, the less friction the pivot needs."""
+"""Reduction of the rotation of a node per body height above the base, relative to the rotation of the base. If less of
+the body rotates with the base, the pivot needs less friction."""
 MIN_TURNED_INERTIA = 0.2
-"""Smallest fraction of the moment of inertia that friction is assumed to rotate, for any counter-rotation."""
+"""Minimum fraction of the moment of inertia that friction is assumed to rotate, whatever the counter-rotation."""
 MAX_SWING_FACTOR = 1.25
-"""Largest factor on the swing time of a pivot that friction under one side cannot complete in the nominal time."""
+"""Maximum factor on the swing time if friction under one side cannot complete a pivot in the nominal time."""
 MAX_FRICTION_USE = 1.2
-"""Peak torque about the up axis of a pivot relative to the friction torque under one side; it may slip a little
-(measured on monkey and pawn)."""
+"""Maximum peak torque of a pivot about the up axis, relative to the friction torque under one side. Above 1, the side
+slips a little (measured on monkey and pawn)."""
 _MAX_CURVATURE = 5.77
-"""Largest second derivative of ``smooth``, the path from 0 to 1 of a foot in a time of 1."""
+"""Maximum second derivative of ``smooth``, the path of a foot from 0 to 1 in unit time."""
 MIN_LEG_LENGTH = 0.2
-"""Shortest legs in body heights; with shorter ones, a body moves as on a single base."""
+"""Minimum length of legs in body heights; with shorter ones, a body moves as on a single base."""
 MAX_SEQUENTIAL_FEET = 4
-"""Number of feet from which on a body is balanced during a swing, so that short legs suffice."""
+"""Minimum number of feet of a body that is balanced during a swing, so that short legs suffice."""
 _SOLE_HEIGHT = 0.02
 """Height in body heights up to which nodes of a base form its sole."""
 _MAX_LEAN = 0.5
@@ -62,15 +63,15 @@ class WalkPosture(Protocol):
     lift: float
     """Lift of a foot, m."""
     capture_range: float
-    """Largest distance in metres from its nominal foothold at which a foot may land to catch the body."""
+    """Maximum distance of a landing foot from its nominal foothold to catch the body, m."""
     timing: GaitTiming
     """Timing of the gait at nominal speed."""
     com_weight: float
-    """Weight of the velocity of the centre of mass: balance."""
+    """Weight of the velocity of the centre of mass, for balance."""
     swing_weight: float
     """Weight of the velocity of a swinging sole."""
     stance_weight: float
-    """Weight of no slip at standing contact points, each scaled by its share of the load."""
+    """Weight of zero slip at standing contact points; each point is scaled by its share of the load."""
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
         """Return the target nodes (N, 3), ground coordinates.
@@ -111,8 +112,8 @@ class LeggedPosture:
 
 
 class RockingPosture:
-    """Posture on a single base: its two sides alternately pivot and tip the body, like a wardrobe that is walked across
-    a floor. The body leans over them, and its upper part rotates in the opposite direction, like shoulders over
+    """Posture on a single base: the body alternately tips and pivots on its two sides, like a wardrobe that is walked
+    across a floor. It leans over the standing side, and its upper part rotates against the base, like shoulders against
     hips."""
 
     def __init__(self, stance: Stance, feet: Sequence[Foot]) -> None:
@@ -123,7 +124,7 @@ class RockingPosture:
         self._com = body.centre_of_mass(self._arms)
         self._share = body.node_mass / body.mass
         self._turning = 1.0 - COUNTER_ROTATION * self._arms[:, 2] / body.height
-        """(N,) rotation of each node relative to that of the base."""
+        """(N,) rotation of each node relative to the rotation of the base."""
         self._between = soles[0] - soles[1]
         self._width = float(np.hypot(*self._between[:2]))
         usual = MAX_FRICTION_USE * self._pivot(stance, soles, self._inertia(body.node_mass))
@@ -158,8 +159,8 @@ class RockingPosture:
         return torque * time**2 / (_MAX_CURVATURE * inertia)
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
-        """Return the target nodes (N, 3), see ``WalkPosture.pose``. The footholds rotate the base; ``heading`` is that
-        of the body as a whole."""
+        """Return the target nodes (N, 3), see ``WalkPosture.pose``. The footholds define the rotation of the base, and
+        ``heading`` the rotation of the whole body."""
         middle, between, rest = feet[:, :3].mean(axis=0), feet[0, :3] - feet[1, :3], self._between
         yaw = np.arctan2(between[1], between[0]) - np.arctan2(rest[1], rest[0])
         across = np.array([between[1], -between[0], 0.0]) / np.hypot(*between[:2])
@@ -173,7 +174,7 @@ class RockingPosture:
         strain[:, 2] *= 1.0 + (com[2] - upright[2]) / self._com[2]
         leant = self._arms @ strain.T
         centre = self._share @ leant
-        # Rotate the upper body less than the base, about the up axis through the centre of mass, which stays in place.
+        # Rotate the upper body less than the base, about the up axis through the centre of mass, which does not move.
         less = (self._turning - 1.0) * (np.remainder(yaw - heading + np.pi, 2.0 * np.pi) - np.pi)
         cos, sin = np.cos(less)[:, None], np.sin(less)[:, None]
         level = (leant - centre)[:, :2]
@@ -183,14 +184,14 @@ class RockingPosture:
 
 
 def select_posture(stance: Stance) -> tuple[tuple[Foot, ...], type[LeggedPosture] | type[RockingPosture]]:
-    """Return the feet on which a body walks, and the class of its posture: its own feet, or the sides of its base.
-    There are no feet if the body lies or rolls."""
+    """Return the feet on which a body walks, its own or the two sides of its base, and the class of its posture. There
+    are no feet if the body lies or rolls."""
     feet, standing, height = stance.feet(), stance.ground.local(stance.standing), stance.body.height
     heights = standing[:, 2] - standing[:, 2].min()
     base = stance.base()
 
     def on_leg(foot: Foot) -> bool:
-        # On few feet, a swing is a fall that the next footprint catches: a stump wider than long does not reach it.
+        # On few feet, a swing is a fall that the next footprint catches. A leg that is wider than long is too short.
         return foot.length >= max(
             MIN_LEG_LENGTH * height, _width(standing[foot.sole]) if len(feet) < MAX_SEQUENTIAL_FEET else 0.0
         )

@@ -1,4 +1,4 @@
-"""Attachment of a muscle's end points: non-negative weights over the nodes around them."""
+"""Attachment of muscle end points: non-negative weights over the nodes around each point."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _MULTIPLIER_PENALTY = 0.05
 def attachment_rows(mesh: TetMesh, points: np.ndarray, *, radius: float | None = None) -> sp.csr_matrix:
     """Attach points to the nodes around them.
 
-    The weights are a Gaussian of width ``radius`` times each node's share of the volume (so that the force density, not
-    the force, is smooth), tilted exponentially so that the weighted centroid B p lies at the point wherever the nodes
-    around it allow it (local maximum-entropy weights, Arroyo and Ortiz 2006). Distances along the mesh's edges exclude
-    nodes across the gap between two limbs.
+    The weight of a node is a Gaussian of width ``radius`` times the node's share of the volume, so that the force
+    density, not the force, is smooth. The weights are tilted exponentially so that the weighted centroid B p lies at
+    the point if the surrounding nodes allow it (local maximum-entropy weights, Arroyo and Ortiz 2006). Distances are
+    measured along the edges of the mesh, so that nodes across the gap between two limbs are excluded.
 
     Args:
         mesh: cage at rest.
@@ -58,8 +58,12 @@ def attachment_rows(mesh: TetMesh, points: np.ndarray, *, radius: float | None =
 def _maximum_entropy_weights(offsets: np.ndarray, shares: np.ndarray) -> np.ndarray:
     """Return weights (n,) >= 0 with sum 1, closest in entropy to shares exp(-|offset|^2), with mean offset near zero.
 
-    Newton's method on the smooth, strictly convex dual log sum(prior exp(offset.t)) + penalty |t|^2 / 2; the penalty
-    keeps t finite where the origin lies outside the nodes' convex hull.
+    Newton's method minimizes the smooth, strictly convex dual log sum(prior exp(offset.t)) + penalty |t|^2 / 2. The
+    penalty keeps t finite if the origin lies outside the convex hull of the nodes.
+
+    Args:
+        offsets: (n, 3) nodes relative to the point, in units of the Gaussian's width.
+        shares: (n,) shares of the volume.
     """
     log_prior = np.log(shares) - np.einsum("ni,ni->n", offsets, offsets)
 

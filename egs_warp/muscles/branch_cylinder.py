@@ -1,4 +1,4 @@
-"""Model of a skeleton's branch as a bent cylinder, and the fibres in it."""
+"""Model of a branch of the skeleton as a bent cylinder, and layout of the fibres in it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.skeleton import Branch
 
 _RADIUS_FRACTION = 0.7
-"""Distance of fibres from the branch's axis, as a fraction of the distance to the surface.
+"""Distance of fibres from the axis of the branch, as a fraction of the distance to the surface.
 
-Fibres near the surface bend the branch more; fibres further inside are attached better.
+Fibres near the surface have longer lever arms for bending; fibres further inside are attached to more nodes.
 """
 _MAX_FLARE = 1.6
 """Maximum distance from the axis to the assumed surface, in section radii.
@@ -27,17 +27,18 @@ class FibreDensity:
     """Number of fibres of each kind in a branch."""
 
     azimuths: int
-    """Longitudinal fibres, evenly around the axis; a multiple of 4 for mirror symmetry in both horizontal axes."""
+    """Number of longitudinal fibres, evenly spaced around the axis; a multiple of 4 for mirror symmetry in both
+    horizontal axes."""
     intervals: int
-    """Segments of each longitudinal or oblique fibre."""
+    """Number of segments of each longitudinal or oblique fibre."""
     radial_levels: int
-    """Levels of radial fibres along the branch."""
+    """Number of levels of radial fibres along the branch."""
     diameters: int
-    """Radial fibres on each level."""
+    """Number of radial fibres on each level."""
     hoops: int
-    """Circular fibres."""
+    """Number of circular fibres."""
     helices: int
-    """Oblique fibres of each handedness."""
+    """Number of oblique fibres of each handedness."""
 
     def segment_count(self) -> int:
         """Return the number of segments of the whole branch."""
@@ -70,7 +71,7 @@ class Surface:
 
 
 class BranchCylinder:
-    """Model of a branch as a bent cylinder: stations along its axis, and the distance to the surface around each."""
+    """Bent cylinder of a branch: stations along its axis, and the distances from each station to the surface."""
 
     def __init__(
         self, branch: Branch, up: np.ndarray, forward: np.ndarray, surface: Surface, edge: float, detail: FibreDensity
@@ -90,10 +91,11 @@ class BranchCylinder:
         self.helper = helpers[int(np.argmin(worst))]
 
     def _place_stations(self, edge: float) -> np.ndarray:
-        """Return the arc lengths of the fibres' vertices: inside a free or ground end, and slightly into a junction.
+        """Return the arc lengths of the fibres' vertices, m.
 
-        A limb's fibres are anchored in the adjoining body but do not cross it. They have a vertex where they enter it,
-        so that they do not leave the body on the inside of the bend.
+        Fibres end inside the branch at a free end or at the ground, and slightly beyond it at a junction: the fibres of
+        a limb are anchored in the adjoining body but do not cross it. They have a vertex at the transition, so that
+        they do not leave the body on the inside of the bend.
         """
         slim = np.flatnonzero(self.branch.own & (self.branch.radii <= 1.25 * np.median(self.branch.radii)))
         enters = float(self.arc[slim[0]]) if len(slim) else 0.0
@@ -134,7 +136,8 @@ class BranchCylinder:
         return direction / np.linalg.norm(direction)
 
     def point(self, arc: float, azimuth: float) -> np.ndarray:
-        """Return the point (3,) of a fibre at an arc length and azimuth index (right-handed about the axis), m."""
+        """Return the point (3,) m of a fibre at arc length ``arc`` (m) and azimuth index ``azimuth``, right-handed
+        about the axis."""
         tangent = self.tangent(arc)
         side = self.helper - (self.helper @ tangent) * tangent
         side /= np.linalg.norm(side)
@@ -145,7 +148,8 @@ class BranchCylinder:
         return centre + _RADIUS_FRACTION * reach * outwards
 
     def fibres(self, name: str) -> list[Fibre]:
-        """Return all fibres of the branch; the ``max_force`` of each is its share of the section's area, m^2."""
+        """Return all fibres of the branch. Their ``max_force`` is not yet a force but the share of the section's area,
+        m^2."""
         count = self.detail.azimuths
         middles = 0.5 * (self.stations[1:] + self.stations[:-1])
         shares = np.array([np.pi * self.radius(middle) ** 2 for middle in middles]) / count

@@ -1,4 +1,4 @@
-"""Geometry of muscle fibres: named polylines in the rest body, before attachment to nodes."""
+"""Geometry of muscle fibres: named polylines in the body at rest, before they are attached to nodes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class FibreKind(Enum):
 
 @dataclass(frozen=True)
 class Fibre:
-    """One polyline of muscle segments in the rest body."""
+    """Polyline of muscle segments in the body at rest."""
 
     name: str
     """Unique name."""

@@ -8,9 +8,10 @@ and ``kind`` and, depending on the kind,
 * ``circular``: ``centre``, ``axis``, ``radius`` and ``segments`` (default 8, at least 3): a closed hoop about the axis;
 * ``radial``: ``centre``, ``axis``, ``radius`` and ``count`` (default 2): diameters across the axis, one fibre each.
 
-Optional in every entry: ``strength`` in body weights (default 2) or ``stiffness`` in N/m, ``group`` (a name), and
-``mirror`` (true or false): true adds the mirror image, its symmetric partner, in the file's ``mirror_plane``
-``{"point": [x, y, z], "normal": [x, y, z]}``. The file may give ``max_strain`` (default 0.3).
+Optional keys of every entry are ``strength`` in body weights (default 2) or ``stiffness`` in N/m, ``group`` (a name),
+and ``mirror`` (true or false). If ``mirror`` is true, the mirror image in the ``mirror_plane`` of the file,
+``{"point": [x, y, z], "normal": [x, y, z]}``, is added as the symmetric partner. The file may set ``max_strain``
+(default 0.3).
 """
 
 from __future__ import annotations
@@ -32,14 +33,15 @@ from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres
 
 MAX_SEGMENTS = 400
-"""Maximum number of segments; the quadratic program has one unknown per segment, and more take seconds a frame."""
+"""Maximum number of segments. The quadratic program has one unknown per segment; with more, a frame takes seconds."""
 
 _SAME_FRAME = BodyFrame(np.eye(3), np.zeros(3), 1.0)
 _COMMON_KEYS = {"name", "kind", "strength", "stiffness", "group", "mirror"}
 _FILE_KEYS = {"fibres", "max_strain", "mirror_plane"}
 _DEFAULT_STRENGTH = 2.0
 _MAX_VALUES = {"strength": 1e3, "stiffness": 1e9}
-"""Maximum values, in body weights and N/m; muscles far stiffer than steel cables leave the solver no precision."""
+"""Maximum strength in body weights, and maximum stiffness in N/m. Muscles that are much stiffer than steel cables cost
+the solver its precision."""
 _MAX_OUTSIDE_EDGES = 1.5
 """Maximum distance of a point from the nearest node, in mean edge lengths."""
 
@@ -50,7 +52,7 @@ def read_muscles(path: Path | str, mesh: TetMesh, *, body_weight: float, frame: 
     Args:
         path: JSON file.
         mesh: cage at rest, m.
-        body_weight: N.
+        body_weight: weight of the body, N.
         frame: frame of the mesh in the coordinates of the file.
 
     Raises:
@@ -95,8 +97,8 @@ def _fibres(
     frame: BodyFrame,
     body_weight: float,
 ) -> tuple[list[Fibre], float]:
-    """Return the fibres of one entry with their mirror images, and their stiffness in N/m, NaN if the entry contains
-    none."""
+    """Return the fibres of one entry with their mirror images, and their stiffness in N/m, NaN if the entry has no
+    stiffness."""
     where = f"{path}: fibre {index + 1}"
     if not isinstance(entry, dict):
         raise UserError(f"{where} is not an object; write {{...}} with a name and a kind")

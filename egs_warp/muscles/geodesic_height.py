@@ -1,8 +1,8 @@
-"""Height-like function that grows along every limb of a body away from the ground.
+"""Geodesic height: a function that increases along every limb of a body away from the ground.
 
-First the drainage field u solves -lap u = 1 with u = 0 at the base (a body heated evenly and cooled at its base). Its
-only minimum is the base and its maxima are the tips. The ascent then has the direction of u's gradient and unit slope,
-as in the heat method of Crane, Weischedel and Wardetzky (2013).
+First, a Poisson equation is solved: -lap u = 1 with u = 0 at the base, as for a body that is heated evenly and cooled
+at its base. The only minimum of u is the base, and its maxima are the tips. The geodesic height then has the direction
+of the gradient of u and unit slope, as in the heat method of Crane, Weischedel and Wardetzky (2013).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from scipy.sparse.linalg import splu
 from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 
 _BASE_FRACTION = 0.02
-"""Height up to which nodes belong to the base, above the body's lowest point, as a fraction of the body's height; 0.4
-edge lengths if that is more."""
+"""Height above the lowest point of the body up to which nodes belong to the base, as a fraction of the body height; at
+least 0.4 edge lengths."""
 
 
 def base_nodes(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
@@ -26,7 +26,8 @@ def base_nodes(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
 
 
 def geodesic_height(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
-    """Return the geodesic height (N,) m: zero at the base, of about unit slope along every limb (module docstring)."""
+    """Return the geodesic height (N,) m: zero at the base, with about unit slope along every limb (module
+    docstring)."""
     volumes = mesh.volumes()
     corners = mesh.nodes[mesh.tets]
     inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])

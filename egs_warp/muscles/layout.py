@@ -20,12 +20,12 @@ _DETAILS = (
     FibreDensity(4, 2, 1, 2, 1, 1),
     FibreDensity(4, 1, 1, 2, 1, 1),
 )
-"""Fibre densities, from the most to the least segments."""
+"""Fibre densities, in descending order of the number of segments."""
 _LEG_DETAILS = (FibreDensity(4, 4, 1, 2, 1, 1), FibreDensity(4, 3, 1, 1, 1, 1), *_DETAILS[-2:])
-"""Densities for each leg of a body with ``_MIN_LEGS`` or more.
+"""Densities for each leg of a body with at least ``_MIN_LEGS`` legs.
 
-To move a foot forward and set it down flat, a leg bends in opposite directions above and below, which needs three
-segments on each of its sides.
+To move a foot forward and set it down flat, a leg bends in opposite directions in its upper and lower parts, which
+needs three segments on each of its sides.
 """
 _MIN_LEGS = 3
 _MAX_SEGMENTS, _MAX_LEGGED_SEGMENTS = 112, 120
@@ -41,13 +41,13 @@ def lay_fibres(
 ) -> list[Fibre]:
     """Lay longitudinal, radial, circular and oblique fibres on every branch.
 
-    If there are too many branches for the segment budget, those with the least volume get none.
+    If there are too many branches for the segment budget, the branches with the least volume get no fibres.
 
     Args:
         mesh: cage at rest, m.
-        skeleton: its curve skeleton.
+        skeleton: curve skeleton of the mesh.
         max_force: maximum force of a segment, N.
-        max_stress: maximum stress of all longitudinal fibres of a section together, Pa.
+        max_stress: maximum total force of the longitudinal fibres of a section per area of the section, Pa.
         max_segments: maximum number of segments; default: 112, or 120 for a body on three legs or more.
     """
     edge = mean_edge_length(mesh)
@@ -65,7 +65,8 @@ def lay_fibres(
 
 
 def _share_segments(skeleton: Skeleton, edge: float, budget: int | None) -> list[tuple[Branch, FibreDensity]]:
-    """Return the fibre density of each branch; similar branches (the four legs of a stool) get the same."""
+    """Return the branches with their fibre densities; similar branches, such as the four legs of a stool, have the
+    same density."""
     legged = is_legged(skeleton)
     budget = budget or (_MAX_LEGGED_SEGMENTS if legged else _MAX_SEGMENTS)
     families: list[list[Branch]] = []
@@ -89,9 +90,10 @@ def _share_segments(skeleton: Skeleton, edge: float, budget: int | None) -> list
         return len(families[family]) * detail(family).segment_count()
 
     def reduction_priority(family: int) -> tuple[bool, float]:
-        """Return the sort key for reductions: segments relative to the square root of the volume.
+        """Return the sort key of a family of branches for reductions: number of segments divided by the square root of
+        the volume.
 
-        Legs count double, since only they act on the ground; the legs of a body on many legs are reduced last.
+        Legs have double weight, since only they act on the ground; the legs of a body on many legs are reduced last.
         """
         volume = sum(branch.volume * (2.0 if branch.starts_on_ground else 1.0) for branch in families[family])
         return ladders[family] is _DETAILS, count(family) / volume**0.5
@@ -113,9 +115,9 @@ def _centre(mesh: TetMesh) -> np.ndarray:
 
 
 def _principal_horizontal(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
-    """Return the unit horizontal direction (3,) in which the body is widest, or a fixed one for a round body.
+    """Return the horizontal unit vector (3,) along which the body is widest, or a fixed one for a round body.
 
-    The sign is fixed, too, so that it does not depend on rounding.
+    Its sign is chosen such that it does not depend on rounding.
     """
     plane = np.stack(orthonormal_basis(up))
     flat = (mesh.nodes - _centre(mesh)) @ plane.T
@@ -133,7 +135,8 @@ _MIRRORED = {FibreKind.OBLIQUE_LEFT: FibreKind.OBLIQUE_RIGHT, FibreKind.OBLIQUE_
 def _with_partners(
     fibres: list[Fibre], centre: np.ndarray, up: np.ndarray, forward: np.ndarray, *, tolerance: float
 ) -> list[Fibre]:
-    """Return the fibres with mirror images as partners, in the vertical principal plane that mirrors more of them."""
+    """Return the fibres with their mirror images as partners. The mirror plane is the one of the two vertical principal
+    planes in which more fibres have a mirror image."""
     best: dict[str, str] = {}
     for normal in (forward, np.cross(up, forward)):
         images: dict[str, str] = {}
@@ -154,7 +157,8 @@ def _with_partners(
 
 
 def _polyline_distance(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the symmetric Hausdorff distance of the vertices of two polylines; infinite if their counts differ."""
+    """Return the symmetric Hausdorff distance, m, of the vertices of two polylines; infinite if their numbers
+    differ."""
     if len(first) != len(second):
         return float("inf")
     apart = np.linalg.norm(first[:, None] - second[None], axis=2)

@@ -9,18 +9,19 @@ import numpy as np
 
 @dataclass(frozen=True)
 class LevelSetCells:
-    """Cells into which the level sets of a field cut the tetrahedra; each tetrahedron has consecutive levels."""
+    """Cells into which the level sets of a field cut T tetrahedra; the cells of a tetrahedron have consecutive
+    levels."""
 
     tet_from_cell: np.ndarray
-    """(C,) tetrahedron of each cell."""
+    """(C,) index of the tetrahedron of each cell."""
     level_from_cell: np.ndarray
     """(C,) level of each cell."""
     touching: np.ndarray
-    """(., 2) pairs of cells of one level that share part of a face."""
+    """(., 2) pairs of cells on the same level that share part of a face."""
     stacked: np.ndarray
-    """(., 2) pairs of cells of one tetrahedron on consecutive levels."""
+    """(., 2) pairs of cells on consecutive levels in the same tetrahedron."""
     first_cell: np.ndarray
-    """(T,) cell of each tetrahedron's lowest level."""
+    """(T,) index of each tetrahedron's cell on its lowest level."""
     first_level: np.ndarray
     """(T,) lowest level of each tetrahedron."""
 
@@ -43,28 +44,28 @@ class LevelSetCells:
         return cls(tet_from_cell, level_from_cell, touching, np.stack([below, below + 1], axis=1), first_cell, first)
 
     def holding(self, tets: np.ndarray, level_field: np.ndarray) -> np.ndarray:
-        """Return the cell (S,) in each of ``tets`` (S,) that contains the point with the field value ``level_field``
-        (S,)."""
+        """Return, for points in the tetrahedra ``tets`` (S,) with field values ``level_field`` (S,), the indices (S,)
+        of the cells that contain them."""
         last_level = np.append(self.first_cell[1:], self.count) - self.first_cell + self.first_level - 1
         level = np.clip(np.floor(level_field).astype(int), self.first_level[tets], last_level[tets])
         return self.first_cell[tets] + level - self.first_level[tets]
 
 
 def _level_range(values: np.ndarray, level_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and last level (rows,) that each row of corner values (rows, corners) covers."""
+    """Return the first and last levels (rows,) that the rows of corner ``values`` (rows, corners) cover."""
     first = np.clip(np.floor(values.min(axis=1)).astype(int), 0, level_count - 1)
     return first, np.clip(np.ceil(values.max(axis=1)).astype(int) - 1, first, level_count - 1)
 
 
 def _runs(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row number and the level of each of the levels first .. last of every row."""
+    """Return row number and level of every level in the range ``first`` to ``last`` (rows,) of each row."""
     counts = last - first + 1
     row = np.repeat(np.arange(len(first)), counts)
     return row, np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts) + first[row]
 
 
 def _inner_faces(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the two tetrahedra (I, 2) at every inner face, and its three nodes (I, 3)."""
+    """Return, for every inner face, its two tetrahedra (I, 2) and its three nodes (I, 3)."""
     faces = np.sort(tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
     order = np.lexsort(faces.T)
     same = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))

@@ -1,4 +1,5 @@
-"""Muscles (Eq. 7): fibres made of segments whose end points are embedded in the body; each segment is an actuator."""
+"""Muscles (Eq. 7): fibres that consist of segments with end points embedded in the body; each segment is an
+actuator."""
 
 from __future__ import annotations
 
@@ -18,15 +19,20 @@ from egs_warp.muscles.layout import is_legged, lay_fibres
 from egs_warp.muscles.skeleton import skeleton
 
 _MIN_AUTOMATIC_EDGES = 0.25
-"""Minimum segment length of an automatic fibre, in mean edges; ends of shorter segments share their nodes."""
+"""Minimum segment length of an automatic fibre, in mean edge lengths; the ends of shorter segments are attached to the
+same nodes."""
 _MAX_STRESS, _MAX_LEG_STRESS = 2.0, 1.0
-"""Maximum stress of all longitudinal fibres of a section together, in units of E, and that of a body on three legs or
-more. The muscles of slender legs crush them with more than 1, and saturate in the thrust and on landing with 0.4."""
+"""Maximum total force of the longitudinal fibres of a section per area of the section, in units of E: in general, and
+for a body on three legs or more. In slender legs, muscles crush the leg above 1, and saturate in the thrust and on
+landing at 0.4."""
 
 
 @dataclass(frozen=True)
 class MuscleSet:
-    """All muscle segments of a body. P end points, M segments, F fibres, N nodes."""
+    """All muscle segments of a body.
+
+    In the shapes below, P is the number of end points, M of segments, F of fibres, and N of nodes.
+    """
 
     end_rows: sp.csr_matrix
     """(P, N) float64, B: end points are B p; non-negative, each row sums to 1."""
@@ -45,9 +51,9 @@ class MuscleSet:
     fibre_names: tuple[str, ...]
     """(F,) unique name of each fibre."""
     fibre_groups: np.ndarray
-    """(F,) int32, group of each fibre (a branch of the body)."""
+    """(F,) int32, group of each fibre: a branch of the body, or the user's choice."""
     fibre_partners: np.ndarray
-    """(F,) int32, mirror-image fibre, -1 for none."""
+    """(F,) int32, index of the mirror image of each fibre, -1 for none."""
 
     @property
     def segment_count(self) -> int:
@@ -66,12 +72,12 @@ class MuscleSet:
 
     @property
     def max_forces(self) -> np.ndarray:
-        """(M,) float64, N, force of each segment at its bound."""
+        """(M,) float64, N, force of each segment at the bound of its activation."""
         return self.stiffness * self.bounds
 
     @cached_property
     def difference_rows(self) -> sp.csr_matrix:
-        """(M, N) float64, B_k - B_i of each segment, whose vector is (B_k - B_i) p."""
+        """(M, N) float64, rows B_k - B_i; the vector of a segment from end i to end k is (B_k - B_i) p."""
         rows = (self.end_rows[self.segments[:, 1]] - self.end_rows[self.segments[:, 0]]).tocsr()
         rows.sort_indices()
         return rows
@@ -97,8 +103,8 @@ def attach_fibres(
 
     Args:
         mesh: cage at rest, m.
-        fibres: at least one, with unique names.
-        max_strain: s_max.
+        fibres: at least one fibre; names are unique.
+        max_strain: maximum strain s_max of a segment.
         radius: width of the attachments, m, see ``attachment_rows``; default: the mean edge length.
 
     Raises:
@@ -157,19 +163,19 @@ def automatic_muscles(
     young_modulus: float | None = None,
     max_segments: int | None = None,
 ) -> MuscleSet:
-    """Make muscles for any body: fibres of every kind along each branch of its skeleton (docs/concepts/muscles.md).
+    """Create muscles for any body: fibres of every kind along each branch of its skeleton (docs/concepts/muscles.md).
 
     The strength is reduced where the body is thin: the total force of all longitudinal fibres of a section is at most
-    ``_MAX_STRESS`` times its area times E, or ``_MAX_LEG_STRESS`` times for a body on three legs or more.
+    ``_MAX_STRESS`` E times the area of the section, or ``_MAX_LEG_STRESS`` E times it for a body on three legs or more.
 
     Args:
         mesh: cage at rest, m.
         plane_normal: (3,) normal of the ground plane, pointing to the body.
-        body_weight: N.
+        body_weight: weight of the body, N.
         height: extent along the normal, m.
-        strength: F_max of a segment, in body weights.
-        max_strain: s_max.
-        young_modulus: E, Pa; default: that of sag 0.05, body_weight height / (0.05 volume).
+        strength: maximum force F_max of a segment, in body weights.
+        max_strain: maximum strain s_max of a segment.
+        young_modulus: E, Pa; default: the value for a sag of 0.05, body_weight height / (0.05 volume).
         max_segments: maximum number of segments; default as in ``lay_fibres``.
     """
     volume = float(mesh.volumes().sum())
@@ -186,7 +192,7 @@ def automatic_muscles(
 
 
 def _long_enough(mesh: TetMesh, fibres: Sequence[Fibre]) -> list[Fibre]:
-    """Return the fibres whose segments keep a minimum length after the attachment of their ends to nodes."""
+    """Return the fibres whose segments have the minimum length after their ends have been attached to nodes."""
     attached = attachment_rows(mesh, np.concatenate([fibre.points for fibre in fibres])) @ mesh.nodes
     polylines = np.split(attached, np.cumsum([len(fibre.points) for fibre in fibres])[:-1])
     shortest = _MIN_AUTOMATIC_EDGES * mean_edge_length(mesh)

@@ -35,7 +35,7 @@ def check_picture_name(path: Path) -> None:
     """Check the name of an image file.
 
     Raises:
-        UserError: the extension is not that of an image format, or the folder does not exist.
+        UserError: the ending does not belong to an image format, or the folder does not exist.
     """
     if path.suffix.lower() not in _EXTENSIONS:
         raise UserError(f"{path}: not the name of an image; let it end in one of {', '.join(_EXTENSIONS)}")
@@ -44,13 +44,13 @@ def check_picture_name(path: Path) -> None:
 
 
 def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarray, front: np.ndarray) -> None:
-    """Write an image of the body from the front, its left and above, with fibres coloured by kind.
+    """Write an image of the body seen from the front, from its left and from above, with fibres coloured by kind.
 
     The axes show body heights, measured along the ground from the middle of the body and upwards from its lowest point.
 
     Args:
         mesh: cage at rest.
-        muscles: its muscles.
+        muscles: muscles of the body.
         path: image file.
         up: (3,) up direction.
         front: (3,) direction in which the body faces, not parallel to ``up``.
@@ -67,8 +67,8 @@ def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarra
     figure = Figure(figsize=(19.2, 7.2), dpi=100, layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
     local = _BodyAxes(mesh, up=up, front=front)
-    # Directions to the right, up and towards the viewer in the picture; each is one of ahead, left and up, or its
-    # opposite.
+    # For each view, the directions to the right, up and towards the viewer; each direction is ahead, left or up of the
+    # body, or the opposite.
     ahead, left, above = np.eye(3)
     views = {
         "from the front": (left, above, ahead),
@@ -112,7 +112,7 @@ class _BodyAxes:
         self._origin = np.append(0.5 * (low + high)[:2], low[2])
         self._height = float(high[2] - low[2])
         self.low, self.high = self(mesh.nodes).min(axis=0), self(mesh.nodes).max(axis=0)
-        """(3,) smallest and largest coordinates of the body."""
+        """(3,) minimum and maximum coordinates of the body, body heights."""
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Transform ``points`` (..., 3)."""
@@ -124,7 +124,7 @@ def _draw_view(axes: Axes, local: _BodyAxes, mesh: TetMesh, muscles: MuscleSet, 
     viewer in the coordinates ahead, left and up."""
     from matplotlib.collections import LineCollection, PolyCollection
 
-    # The ticks show these coordinates; one that increases to the left is drawn on an inverted axis.
+    # The ticks show these coordinates; the axis of a coordinate that increases to the left is inverted.
     shown = np.abs(directions)
     corners = local(mesh.nodes[mesh.boundary_faces()])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

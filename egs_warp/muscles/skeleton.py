@@ -1,9 +1,8 @@
-"""Curve skeleton of a body: branches (legs, trunk, arms) from the ground up, each a polyline with sections.
+"""Curve skeleton of a body: its branches (legs, trunk, arms) as polylines with sections, directed away from the ground.
 
-The body's sections are the connected components between level sets of a height-like function
-(``egs_warp.muscles.geodesic_height``). Their adjacency is the Reeb graph, whose short and thin chains are merged into
-their neighbours. Level sets cut through tetrahedra, so that the skeleton of a coarse mesh is as fine as that of a dense
-one.
+The sections of the body are the connected components between level sets of the geodesic height
+(``egs_warp.muscles.geodesic_height``). Their adjacency is the Reeb graph. Short and thin chains of the graph are merged
+into their neighbours. Level sets cut through tetrahedra, so that a coarse mesh gives as fine a skeleton as a dense one.
 """
 
 from __future__ import annotations
@@ -20,36 +19,38 @@ from egs_warp.muscles.geodesic_height import geodesic_height
 from egs_warp.muscles.level_set_cells import LevelSetCells
 
 _SECTION_COUNT = 24
-"""Sections from the base to the farthest tip."""
+"""Number of sections from the base to the farthest tip."""
 _SAMPLES_PER_EDGE = 4
-"""A tetrahedron is sampled at the points of a lattice with this many along its edge (20 points in all)."""
+"""Number of samples along the edge of a tetrahedron, which is sampled at the 20 points of a lattice."""
 _SMOOTHING_PASSES = 3
 _CAP_SECTIONS = 3
-"""Sections that are merged at a free end of a long branch."""
+"""Number of sections that are merged at a free end of a long branch."""
 _MIN_BRANCH_VOLUME = 0.01
 """Minimum volume of a branch, as a fraction of the body's volume."""
 _MIN_BRANCH_SLENDERNESS = 1.5
-"""Minimum length of a branch with a free end, in its own radii; shorter ones are bumps."""
+"""Minimum ratio of length to radius of a branch with a free end; shorter branches are bumps."""
 
 
 @dataclass(frozen=True)
 class Branch:
-    """A limb or the trunk: polyline of K points through the centres of its sections, directed away from the ground."""
+    """A limb or the trunk, as a polyline of K points through the centres of its sections, directed away from the
+    ground.
+    """
 
     points: np.ndarray
-    """(K, 3) float64, m, K >= 2."""
+    """(K, 3) float64, m, points of the polyline, K >= 2."""
     radii: np.ndarray
-    """(K,) float64, m, radius of the disc with the section's area."""
+    """(K,) float64, m, radius of the disc with the area of the section at each point."""
     own: np.ndarray
     """(K,) bool, True where the section belongs to this branch only, False inside a junction."""
     starts_on_ground: bool
-    """True if its first point lies on the body's base."""
+    """True if the first point lies on the base of the body."""
     ends_freely: bool
-    """True if its last point is a tip of the body."""
+    """True if the last point is a tip of the body."""
     volume: float
-    """Volume of its own sections, m^3."""
+    """Volume of the sections that belong to this branch only, m^3."""
     sections: tuple[tuple[int, ...], ...]
-    """K tuples, numbers of the sections of each point, also of those in junctions; none for an end point that only
+    """Section numbers of each of the K points, including sections in junctions; empty for an end point that only
     extends the polyline."""
 
     @property
@@ -63,7 +64,7 @@ class Skeleton:
     """Curve skeleton of a body."""
 
     branches: tuple[Branch, ...]
-    """Sorted by descending volume."""
+    """Branches in descending order of volume."""
     up: np.ndarray
     """(3,) unit vector away from the ground."""
     samples: np.ndarray
@@ -73,9 +74,9 @@ class Skeleton:
 
 
 def skeleton(mesh: TetMesh, up: np.ndarray) -> Skeleton:
-    """Compute the curve skeleton of ``mesh``, whose lowest nodes are on the ground; ``up`` (3,) points away from it.
+    """Compute the curve skeleton of ``mesh``. Equal meshes give equal bits.
 
-    The result is deterministic to the bit.
+    The lowest nodes of the mesh are on the ground; ``up`` (3,) is the unit vector away from the ground.
     """
     up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     graph = _SectionGraph(mesh, geodesic_height(mesh, up), up)
@@ -126,7 +127,7 @@ class _SectionGraph:
         return sum(float(self.sample_volumes[self.members[section]].sum()) for section in sections)
 
     def merge_insignificant_chains(self) -> None:
-        """Merge the smallest insignificant chain into its neighbours until every chain is a limb."""
+        """Merge the smallest insignificant chain into its neighbours, repeatedly, until none is left."""
         while True:
             chains = [chain for chain in self.chains() if self._is_insignificant(chain)]
             if not chains:
@@ -134,7 +135,7 @@ class _SectionGraph:
             self._merge(min(chains, key=lambda chain: (self.volume(self._own(chain)), chain)))
 
     def chains(self) -> list[list[int]]:
-        """Return the paths between junctions or ends, including both, each once and directed upwards."""
+        """Return the chains: paths between junctions or ends, including both, each once and directed upwards."""
         special = [
             section for section, others in self.neighbours.items() if len(others) != 2 or self._is_extreme(section)
         ]
@@ -150,10 +151,11 @@ class _SectionGraph:
         return chains
 
     def joined_chains(self) -> list[list[int]]:
-        """Return the chains, where a chain that dominates the junction at its end continues with the largest one above.
+        """Return the chains after joining: a chain that dominates the junction at its end continues with the largest
+        chain above.
 
-        A chain dominates if it is the only one below the junction or has twice the volume of the next: a trunk beside a
-        hand that rests on the hip, but no leg of a stool.
+        A chain dominates if it is the only one below the junction or has twice the volume of the second one. A trunk
+        dominates a hand that rests on the hip, but no leg of a stool dominates the others.
         """
         chains = self.chains() or [[section, section] for section in self.neighbours]
         for junction in sorted(self.neighbours, key=lambda section: (self.level[section], section)):
@@ -175,7 +177,7 @@ class _SectionGraph:
         """Return the branch of a chain of sections; its polyline extends to the tip of a free end, or to the base."""
         sections = [section for section in chain if len(self.members[section])] or chain
         grounded, ends_freely = self.grounded[sections[0]], len(self.neighbours[sections[-1]]) <= 1
-        # The last sections of a blunt end depend on the mesh, so their common centroid is used.
+        # The last sections of a blunt end depend on the mesh, so use the centroid of their union.
         cap = _CAP_SECTIONS if len(sections) >= 3 * _CAP_SECTIONS else 1
         groups = [[section] for section in sections]
         if not grounded and self._is_free(sections[0]):
@@ -207,7 +209,7 @@ class _SectionGraph:
         return np.average(self.samples[members], axis=0, weights=self.sample_volumes[members])
 
     def _tip(self, members: np.ndarray, last_points: list[np.ndarray]) -> np.ndarray:
-        """Return the tip of a free end: the last point, moved along the axis to the extent of the samples."""
+        """Return the tip (3,) m of a free end: the last point, moved along the axis to the farthest sample."""
         middle = last_points[-1]
         axis = middle - last_points[0]
         length = float(np.linalg.norm(axis))
@@ -215,7 +217,7 @@ class _SectionGraph:
         return middle + float(((self.samples[members] - middle) @ axis).max()) * axis
 
     def _ground_point(self, section: int) -> np.ndarray:
-        """Return the centre of the section's lowest layer, projected to the ground."""
+        """Return the centre (3,) m of the lowest layer of ``section``, projected onto the ground."""
         members = self.members[section]
         heights = self.samples[members] @ self.up
         base = self._middle(members[heights <= heights.min() + 0.5 * self.thickness])
@@ -250,7 +252,7 @@ class _SectionGraph:
         if self._is_free(chain[0]) or self._is_free(chain[-1]):
             too_small = self.volume(own) < _MIN_BRANCH_VOLUME * self.total_volume
             return too_small or len(own) < 2 or length < _MIN_BRANCH_SLENDERNESS * mean_radius
-        # Between two junctions, a short link only separates limbs that leave the body at about the same position.
+        # A short link between two junctions only separates limbs that leave the body at about the same position.
         return len(own) < 2 or length < mean_radius
 
     def _merge(self, chain: list[int]) -> None:

@@ -1,4 +1,4 @@
-"""Nodal forces of muscle activations (Eq. 7): an energy for the equation of motion, and columns for the quadratic
+"""Nodal forces of muscle activations (Eq. 7): as an energy in the equation of motion, and as columns of the quadratic
 program.
 
 The kernel is in ``egs_warp.kernels.muscles.impulses``.
@@ -31,7 +31,7 @@ def segment_vectors(rows: sparse.csr_matrix, positions: np.ndarray) -> tuple[np.
         positions: (N, 3) m, node positions.
 
     Returns:
-        Vectors (M, 3) m and lengths (M,) m, at least 1e-300, so that a segment whose ends coincide has the direction 0.
+        Vectors (M, 3) m, and lengths (M,) m of at least 1e-300, so that a segment with coincident ends has direction 0.
     """
     vectors = rows @ positions
     return vectors, np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)
@@ -44,11 +44,12 @@ def shortening(muscles: MuscleSet, start: np.ndarray, end: np.ndarray) -> np.nda
 
 
 def force_length_factor(shortened: Any) -> tuple[Any, Any, Any]:
-    """Return phi, its integral from 0 and its derivative at relative lengths ``shortened``, a NumPy array or a tensor.
+    """Return the force-length factor phi, its integral from 0, and its derivative at the relative lengths
+    ``shortened``, a NumPy array or a tensor.
 
-    A strongly shortened muscle exerts less force: the ascending limb of the force-length relation (Gordon, Huxley and
-    Julian 1966), here a smooth step from ``LENGTH_ZERO_FORCE`` to ``LENGTH_FULL_FORCE``. With a constant tension, two
-    ends could be pulled into one point, where the force has no direction and the step has no solution.
+    A strongly shortened muscle exerts less force. This is the ascending limb of the force-length relation (Gordon,
+    Huxley and Julian 1966), here a smooth step from ``LENGTH_ZERO_FORCE`` to ``LENGTH_FULL_FORCE``. A constant tension
+    could pull both ends of a segment into one point, where its force has no direction and the step has no solution.
     """
     width = LENGTH_FULL_FORCE - LENGTH_ZERO_FORCE
     along = ((shortened - LENGTH_ZERO_FORCE) / width).clip(0.0, 1.0)
@@ -57,8 +58,10 @@ def force_length_factor(shortened: Any) -> tuple[Any, Any, Any]:
 
 
 def segment_stiffnesses(tensions: Any, lengths: Any, rest_lengths: Any) -> tuple[Any, Any]:
-    """Return the transverse and the axial stiffness of segments, N/m, arrays or tensors: the tension divided by the
-    length, and its derivative with respect to the length, which is 0 at full force.
+    """Return the transverse and the axial stiffness of segments, N/m, as arrays or tensors.
+
+    They are the tension divided by the length, and the derivative of the tension with respect to the length, which is 0
+    at full force.
     """
     share, _, slope = force_length_factor(lengths / rest_lengths)
     return tensions * share / lengths, tensions * slope / rest_lengths
@@ -67,14 +70,14 @@ def segment_stiffnesses(tensions: Any, lengths: Any, rest_lengths: Any) -> tuple
 def activation_jacobian(muscles: MuscleSet, positions: np.ndarray) -> sparse.csc_matrix:
     """Return A(p) of Eq. (7), (3N, M) N/m: nodal forces per metre of activation, at node ``positions`` (N, 3).
 
-    Column j is k_j phi (B_i^T u - B_k^T u), u the unit vector from end i to end k: a_j > 0 contracts.
+    Column j is k_j phi (B_i^T u - B_k^T u), where u is the unit vector from end i to end k; a_j > 0 contracts.
     """
     rows = muscles.difference_rows
     vectors, lengths = segment_vectors(rows, positions)
     share, _, _ = force_length_factor(lengths / muscles.rest_lengths)
     pulls = -(muscles.stiffness * share)[:, None] * (vectors / lengths[:, None])
     entries = rows.data[:, None] * np.repeat(pulls, np.diff(rows.indptr), axis=0)
-    # One entry of a segment's row gives three of its column: x, y and z of the node.
+    # Each entry of a segment's row gives three entries of its column, for x, y and z of the node.
     nodes = (3 * rows.indices[:, None] + np.arange(3)).ravel()
     return sparse.csc_matrix(
         (entries.ravel(), nodes, 3 * rows.indptr), shape=(3 * muscles.node_count, len(rows.indptr) - 1)
@@ -82,10 +85,10 @@ def activation_jacobian(muscles: MuscleSet, positions: np.ndarray) -> sparse.csc
 
 
 class SynergyColumns:
-    """Impulse columns of groups of segments that share an activation: index maps and memory, on the host."""
+    """Impulse columns of groups of segments that share an activation, computed on the host into reused memory."""
 
     def __init__(self, muscles: MuscleSet, group_from_muscle: np.ndarray) -> None:
-        """Build the maps; ``group_from_muscle`` (M,) has values from 0 to m - 1."""
+        """Create the index maps; ``group_from_muscle`` (M,) is the group of each segment, from 0 to m - 1."""
         rows, self._count = muscles.difference_rows, int(group_from_muscle.max(initial=-1)) + 1
         order = np.argsort(group_from_muscle, kind="stable")
         offsets = np.searchsorted(group_from_muscle[order], np.arange(self._count + 1))
@@ -103,10 +106,10 @@ class SynergyColumns:
         self._rows = wp.array(self._impulses.reshape(len(self._impulses), -1, 3), dtype=Vec3, device="cpu", copy=False)
 
     def with_base(self, other: np.ndarray, positions: np.ndarray, dt: float) -> np.ndarray:
-        """Return the impulses of each group at its bound, and ``other`` as the last column.
+        """Return the impulses of each group at the bounds of its activations, and ``other`` as the last column.
 
         Args:
-            other: (3N,) N s.
+            other: (3N,) N s, another impulse.
             positions: (N, 3) m, node positions.
             dt: step size, s.
 
@@ -133,17 +136,17 @@ class MuscleEnergy:
     phi (``force_length_factor``). If all relative lengths are at least ``LENGTH_FULL_FORCE``, V is sum_j T_j |D_j p|
     plus a constant.
 
-    The force is that of Eq. (7) at ``p``, so it rotates with the body. Forces with the directions of the step's start
-    would be dead loads: they lack the transverse stiffness T / L of the tension, and slender parts would buckle under
-    muscles that in reality keep them straight.
+    The negative gradient at ``p`` is the force of Eq. (7), which rotates with the body. Forces with the directions at
+    the start of the step would be dead loads: they would lack the transverse stiffness T / L of the tension, and
+    slender parts would buckle under muscles that in reality keep them straight.
     """
 
     rows: sparse.csr_matrix
     """(M, N) difference rows D."""
     tensions: np.ndarray
-    """(M,) N, positive where the segment contracts."""
+    """(M,) N, tensions, positive for segments that contract."""
     rest_lengths: np.ndarray
-    """(M,) m."""
+    """(M,) m, lengths at rest."""
 
     @classmethod
     def of(cls, muscles: MuscleSet, activations: np.ndarray) -> MuscleEnergy:
@@ -176,17 +179,17 @@ class MuscleEnergy:
 class TensionHessian:
     """Hessian K = sum_j D_j^T (r_j (I - u_j u_j^T) + s_j u_j u_j^T) D_j, in factored form.
 
-    K is never assembled, since the ends of a segment are spread over dozens of nodes.
+    K is never assembled, because the end points of a segment are attached to dozens of nodes.
     """
 
     rows: sparse.csr_matrix
     """(M, N) difference rows D."""
     directions: np.ndarray
-    """(M, 3) u, unit vectors of the segments."""
+    """(M, 3), u, unit vectors of the segments."""
     transverse_stiffness: np.ndarray
-    """(M,) N/m, r, tension divided by length."""
+    """(M,), r, N/m, tension divided by length."""
     axial_stiffness: np.ndarray
-    """(M,) N/m, s, derivative of the tension with respect to the length; 0 at full force."""
+    """(M,), s, N/m, derivative of the tension with respect to the length; 0 at full force."""
 
     def factors(self, *, min_relative_stiffness: float) -> tuple[np.ndarray, np.ndarray]:
         """Return U (3N, n) and rates (n,) N/m with K = U diag(rates) U^T, for the terms of ``rank_one_terms``."""
@@ -198,10 +201,10 @@ class TensionHessian:
         """Return the rank-1 terms of which K is the sum: two transverse directions and the axis of each segment.
 
         Args:
-            min_relative_stiffness: terms whose rate is at most this fraction of the largest are dropped.
+            min_relative_stiffness: terms with a stiffness of at most this fraction of the maximum are dropped.
 
         Returns:
-            Segments (n,), unit vectors (n, 3) and rates (n,) N/m.
+            Indices of the segments (n,), unit vectors (n, 3), and stiffnesses (n,) N/m of the terms.
         """
         axis = np.eye(3)[np.argmin(np.abs(self.directions), axis=1)]
         first = np.cross(self.directions, axis)

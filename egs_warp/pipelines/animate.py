@@ -42,9 +42,9 @@ from egs_warp.pipelines.simulated_run import check_frames
 from egs_warp.pipelines.takes import simulate_takes
 
 PREVIEW_GAUSSIANS = 50_000
-"""Gaussians of a preview."""
+"""Maximum number of Gaussians in a preview."""
 PREVIEW_SIZE = 256
-"""Width and height of a preview, pixels."""
+"""Maximum width and height of a preview, pixels."""
 
 
 @dataclass(frozen=True)
@@ -55,11 +55,11 @@ class AnimateOptions:
     """
 
     distance: float | None = None
-    """Body heights; None is the default of the motion."""
+    """Target distance, body heights; None uses the default of the motion."""
     height: float | None = None
-    """Body heights; None is the default of the motion."""
+    """Target height, body heights; None uses the default of the motion."""
     heading_degrees: float | None = None
-    """Degrees to the left; None is the default of the motion."""
+    """Target change of heading, degrees to the left; None uses the default of the motion."""
     beats: str | None = None
     """Beats of a dance: a tempo, or the name of a file (``egs_warp.motions.beats``)."""
     style: str | None = None
@@ -72,29 +72,29 @@ class AnimateOptions:
     """If the body falls and nothing pushes it, simulate its motion again in a gentler form
     (``egs_warp.pipelines.takes``)."""
     frames: int | None = None
-    """Frames at 60 Hz, the first at rest; None runs until the last motion has come to rest."""
+    """Number of frames at 60 Hz, the first at rest; None simulates until the body rests after the last motion."""
     size: int = 512
-    """Width and height of the video, pixels, if ``shot`` has no size and it is no preview."""
+    """Width and height of the video, pixels, unless ``shot`` has a size or ``preview`` is set."""
     shadow: bool = True
     """Draw a shadow on the ground under the object."""
     light: MainLight | None = None
-    """Main light, in the axes of the capture, by which the creature is relit and casts its shadow (``prepare_scene``);
-    None keeps the captured colours, and the shadow is straight below the object."""
+    """Main light in the axes of the capture (``prepare_scene``), which relights the creature and casts its shadow. None
+    keeps the captured colours and draws the shadow straight below the object."""
     preview: bool = False
     """Draw at most ``PREVIEW_GAUSSIANS`` Gaussians, and at most ``PREVIEW_SIZE`` pixels if ``shot`` has no size."""
     view_from: Direction | None = None
-    """(3,) Direction from the object to the camera, in the capture's frame, or an axis; of several (n, 3) the best is
-    chosen."""
+    """Direction (3,) from the object to the camera, in the capture's frame, or an axis; the best is chosen from several
+    directions (n, 3)."""
     shot: Shot = field(default_factory=Shot)
     """Camera motion, size, frame rate and background colour of the video."""
     creature: CreatureOptions = field(default_factory=CreatureOptions)
     """Body, muscles, ground and solver."""
     seed: int = 0
-    """Written to the report. No computation is random, so it changes no result."""
+    """Seed in the report. No computation is random, so it does not change the result."""
     source: str = "capture"
     """Name of the capture in the report."""
     notes: tuple[str, ...] = ()
-    """Notes for the report, before those of the run."""
+    """Notes for the report that precede the notes of the run."""
 
     def __post_init__(self) -> None:
         for name, value in (("distance", self.distance), ("height", self.height)):
@@ -133,7 +133,7 @@ class AnimateOptions:
         return direction_of(directions, "view_from")
 
     def to_json(self, *, up: np.ndarray | None = None, plane: Plane | None = None) -> dict[str, JsonValue]:
-        """Return ``asked`` of the report, with ``up`` and ``plane`` of the run; what was not given is null."""
+        """Return the entry ``asked`` of the report, with ``up`` and ``plane`` of the run; omitted options are null."""
         creature, settings = self.creature, self.creature.settings or LocomotionSettings()
         view_from = self.directions_to_camera()
         return {
@@ -191,11 +191,11 @@ def animate(
         up: (3,) Up in the capture's frame, or an axis (``make_creature``).
         plane: Ground plane in the capture's frame (``make_creature``).
         background: Gaussians behind the object, in the capture's frame and units; None draws a plain floor.
-        options: Targets, video and creature; None is the default.
+        options: Targets, video and creature; None uses the default.
         overwrite: Move an earlier run in ``out`` aside.
         resume: Continue the interrupted run in ``out``; equal arguments give equal bits.
         quiet: Show no progress bars.
-        show_note: Called once with each note for the user beyond ``options.notes``, as soon as it is known.
+        show_note: Called once with each note for the user that is not in ``options.notes``, as soon as it is known.
 
     Returns:
         The contents of ``report.json`` (docs/guide/report.md).
@@ -307,7 +307,10 @@ def animate(
 
 
 def _requested(motion: Script | str, options: AnimateOptions) -> Script:
-    """Return the script of ``animate``. Raises ``ArgumentError`` for targets beside a script, which has its own."""
+    """Return the script of ``animate``.
+
+    Raises ``ArgumentError`` if targets are given together with a ``Script``, which has its own.
+    """
     given = {"beats": options.beats, **options.targets()}
     if isinstance(motion, str):
         return script(motion, **given)

@@ -1,4 +1,4 @@
-"""Check by a short stand whether the muscles of a user can balance a body."""
+"""Simulation of a short stand that checks whether muscles from a user's file can balance a body."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ from egs_warp.pipelines.facing_direction import Front
 from egs_warp.pipelines.simulated_run import MIN_FRAMES, simulate
 
 _STAND_TIME = 6.0
-"""Time of the stand in sqrt(H / g)."""
+"""Duration of the stand, in units of sqrt(H / g)."""
 _MOTION = "stand 60"
-"""Motion of the check; the number of frames ends it."""
+"""Motion of the check, which the number of frames ends before it is complete."""
 _IMPULSE = 0.05
-"""Impulse of the push at its start, m sqrt(g H): a body at rest on a wide base stands without muscles."""
+"""Impulse of the push at the start, in units of m sqrt(g H). Without a push, a body on a wide base would stand even
+without muscles."""
 
 
 def own_muscles_notes(cloud: GaussianCloud, standing: PlacedCage, facing: Front, muscles_file: Path) -> tuple[str, ...]:
-    """Return the notes of ``balance_note`` for the muscles of a file on level ground.
+    """Return the note of ``balance_note``, if any, for the muscles of a file on level ground.
 
     Args:
         cloud: The capture.
-        standing: Its cage.
-        facing: Its front.
+        standing: Cage of the capture.
+        facing: Facing direction of the body.
         muscles_file: Muscles (JSON, ``egs_warp.muscles.files``).
     """
     front = facing.direction @ standing.frame.axes
@@ -47,7 +48,7 @@ def balance_note(creature: Creature) -> str | None:
         return None
     step = creature.body.time_unit / MIN_STEPS_PER_TIME_UNIT
     frame = max(1.0 / FRAME_RATE, step)
-    # A stepper of its own, so that the check leaves no trace in the run that follows.
+    # A copy of the stepper, so that the check does not change the state of the run that follows.
     run = simulate(
         replace(creature, stepper=copy(creature.stepper)),
         _MOTION,

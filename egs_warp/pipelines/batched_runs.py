@@ -1,4 +1,4 @@
-"""Batched runs: jobs with prescribed activations, many at a time in one process on the creature's device."""
+"""Batched runs: simulation of many jobs with prescribed activations at once, in one process on one device."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ if TYPE_CHECKING:
     from egs_warp.locomotion.batch import BatchStepper
 
 MAX_WORLDS = 1024
-"""Maximum number of jobs in a batch: larger ones are hardly faster, and their results stay in memory until they end."""
+"""Maximum number of jobs in a batch. Larger batches are hardly faster, and all results stay in memory until the batch
+ends."""
 _MEMORY_FRACTION = 0.4
 """Fraction of the free memory of a GPU that matrix factors may use."""
 _MIN_JOBS_PER_CORE = 2
-"""Number of jobs per core of the machine above which a batch is faster than worker processes: on an H100, eight worlds
-of 253 nodes make 101 steps per second in total, and one process makes 21."""
+"""Number of jobs per core of the machine from which a batch is faster than worker processes. On an H100, a batch of
+eight worlds of 253 nodes computes 101 steps per second in total, and one worker process computes 21."""
 
 
 def choose_batch_size(creature: Creature, jobs: int) -> int:
@@ -94,9 +95,9 @@ class _BatchJob:
     dt: float
     """Step size, s."""
     per_frame: int
-    """Steps in a frame."""
+    """Number of steps per frame."""
     activations: np.ndarray
-    """(steps, M) m, prescribed activations for a whole number of frames."""
+    """(steps, M) m, prescribed activations; ``steps`` is a multiple of ``per_frame``."""
 
 
 def _make_batch_job(creature: Creature, number: int, job: Job, _: ProgressCallback) -> _BatchJob:
@@ -161,7 +162,7 @@ def _run(
     )
     starts = [creature.start] * len(batch)
     is_unsolvable = [False] * len(batch)
-    # With its own friction, the creature is already at rest.
+    # Without a friction of the job, the creature is already at rest.
     if any(one.job.friction is not None for one in batch):
         settled, failed = stepper.settle()
         has_friction = [one.job.friction is not None for one in batch]

@@ -34,7 +34,7 @@ def export_bundle(
         run: The run to export.
         path: Name that ends in .egs.
         every: Export each ``every``-th frame at 60 Hz.
-        degree: SH degree of the colours; None keeps that of the capture.
+        degree: SH degree of the colours; None keeps the degree of the capture.
         licence: Licence of the content, as the file will state it.
 
     Raises:

@@ -11,8 +11,8 @@ from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 MIN_GAUSSIANS = 100
 """Number of Gaussians below which most of the body's shape is extrapolated."""
 _DETACHED_DISTANCE = 0.15
-"""Distance from the cage beyond which a Gaussian is detached, body heights; at least one edge of the cage. Floaters
-that the cage excludes are nearer."""
+"""Distance from the nearest cage node beyond which a Gaussian is detached, body heights; at least the mean length of an
+edge of the cage. Floaters that the cage excludes are nearer."""
 _MIN_DETACHED_SHARE = 0.01
 """Fraction of the opacity in detached Gaussians above which there is a warning."""
 

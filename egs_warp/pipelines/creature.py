@@ -42,22 +42,22 @@ from egs_warp.segmentation.base_plane import find_base_plane, guess_up
 from egs_warp.short_repr import short_repr
 
 MIN_SAG = 0.004
-"""Fraction of the height: a body that its weight bends is made stiffer until its sag is below this."""
+"""Fraction of the height: the sag of a body that its weight bends too much is halved, but not once it is below this."""
 _STRENGTH_POWER = 3
-"""Power of the relative stiffness to which the strength of automatic muscles is proportional. In proportion to the
-stiffness itself, they brake the swing of a soft part before it returns."""
+"""Exponent p: in soft parts, the strength of automatic muscles is proportional to the relative stiffness to the power
+p. With p = 1, the muscles stop the swing of a soft part before it returns."""
 MAX_SLOPE = 45.0
-"""Degrees; steeper ground is rejected."""
+"""Maximum slope of the ground, degrees; steeper ground is rejected."""
 _GROUND_SPACING = 0.5
 """Spacing of the nodes of uneven ground, in mean cage edges; contact points are 0.4 of an edge apart."""
 _CAGE_BITS = 32
-"""Bits to which the cage's coordinates are rounded, relative to the height."""
+"""Number of bits to which the cage's coordinates are rounded, relative to the height."""
 _CONTACT_GRID = 2.0**-10
-"""Fraction of the height to which contact points are rounded. A jump is sensitive to the last bit of a number, and
-the last bits of a file change if the capture is rotated or its unit changes.
+"""Fraction of the height to which contact points are rounded. Jumps are sensitive to the last bits of coordinates,
+which change if a capture is rotated or its unit changes.
 """
 _FRONT_GRID = np.pi / 2**12
-"""Radians to which the facing direction is rounded, for the same reason."""
+"""Angle to a multiple of which the facing direction is rounded, radians, for the same reason as ``_CONTACT_GRID``."""
 _FOOT_HEIGHT = 0.1
 """Fraction of the height above uneven ground below which parts of the object may touch it."""
 MAX_FRICTION = 10.0
@@ -71,12 +71,12 @@ class CreatureOptions:
     metres_per_unit: float | None = None
     """Length of one unit of the capture, m; None makes the body 1 m tall."""
     sag: float = DEFAULT_SAG
-    """Fraction of its height by which the body sags under its weight, which defines its stiffness. A body that its
-    weight would bend out of shape is made stiffer."""
+    """Fraction of its height by which the body sags under its weight, which defines its stiffness. The stiffness is
+    increased if the weight would bend the body out of shape."""
     overlap: float = 0.0
-    """Fraction of its length by which a part that sticks out (an ear, an arm, a tail; ``find_protrusions``) would sag
-    under its weight, 0 to 0.5, which defines its stiffness: it lags behind the body and settles after it. 0 leaves the
-    stiffness of the body."""
+    """Softness of parts that stick out (an ear, an arm, a tail; ``find_protrusions``), 0 to 0.5: the fraction of its
+    length by which such a part would sag under its weight. Soft parts lag behind the body and settle after it. With 0,
+    they are as stiff as the body."""
     nodes: int = 500
     """Approximate number of cage nodes."""
     cage_file: Path | None = None
@@ -92,12 +92,11 @@ class CreatureOptions:
     ground: HeightField | None = None
     """Ground that is not flat, in place of a plane."""
     gravity_up: Direction | None = None
-    """(3,) Direction against gravity, or an axis; None is the normal of the ground, other directions make it a slope.
-    """
+    """(3,) Direction opposite to gravity, or an axis; None uses the normal of the ground, which is then level."""
     solids: tuple[Solid, ...] = ()
     """Steps and walls in addition to the ground."""
     settings: LocomotionSettings | None = None
-    """Solver settings, such as the contact strategy and the QP solver; None is the default."""
+    """Solver settings, such as the contact strategy and the QP solver; None uses the default."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.friction <= MAX_FRICTION:
@@ -185,10 +184,10 @@ def make_creature(
     Args:
         cloud: The capture.
         up: (3,) Up direction, or an axis such as ``"-y"``; without a ``plane``, the ground is the base of the object,
-            orthogonal to ``up``. Without ``plane``, ``up`` and ``options.ground``, up is that of the file, else
-            estimated (``guess_up``), with a note.
+            orthogonal to ``up``. If ``plane``, ``up`` and ``options.ground`` are all None, the up direction of the file
+            is used; if the file has none, it is estimated (``guess_up``). A note reports it.
         plane: Ground plane.
-        options: Body, muscles, ground and solver; None is the default.
+        options: Body, muscles, ground and solver; None uses the default.
         progress: Called with the name of each stage as it starts.
 
     Raises:
@@ -231,11 +230,11 @@ def creature_in_cage(
     notes: tuple[str, ...] = (),
     progress: Callable[[str], object] = lambda stage: None,
 ) -> Creature:
-    """Return the creature of ``make_creature`` in the cage ``standing`` that ``place_cage`` made of its capture.
+    """Create the creature of a capture whose cage has been built already (``make_creature``).
 
     Args:
         cloud: The capture.
-        standing: Its cage.
+        standing: Cage of the capture (``place_cage``).
         options: Body, muscles, ground and solver.
         notes: Guesses about the capture.
         progress: Called with the name of each stage as it starts.
@@ -245,7 +244,7 @@ def creature_in_cage(
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in options.solids)
     field = None
     if options.ground is not None:
-        # The cage cannot deform to ground that is finer than its own edges.
+        # The cage cannot follow details of the ground that are smaller than its edges.
         field = frame.height_field(options.ground).coarser(_GROUND_SPACING * mean_edge_length(cage.mesh))
     geometry = contact_geometry(
         standing.gaussians,
@@ -282,8 +281,8 @@ def creature_in_cage(
 
 
 def estimated_up(cloud: GaussianCloud, *, advice: str) -> tuple[np.ndarray, str]:
-    """Return the up direction (3,) of a capture, from its file or estimated, and a note for the user that ends with
-    ``advice``."""
+    """Return the up direction (3,) of a capture, from its file or else estimated. The second result is a note for the
+    user, which ends with ``advice``."""
     file_up, vertical_axis = (cloud.up, cloud.vertical_axis) if isinstance(cloud, Capture) else (None, None)
     up, reason = guess_up(cloud, file_up, vertical_axis=vertical_axis)
     axis = int(np.argmax(np.abs(up)))
@@ -308,7 +307,7 @@ def plane_below(cloud: GaussianCloud, ground: HeightField) -> Plane:
 
 
 def changed_creature(creature: Creature, *, friction: float, sag: float, muscles_file: Path | None) -> Creature:
-    """Return ``creature`` at rest with another friction and stiffness; cage and ground stay the same.
+    """Return ``creature`` at rest with another friction and stiffness, but the same cage and ground.
 
     Args:
         creature: The creature to change.
@@ -328,8 +327,11 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
 
 
 def _simulation_device(cloud: GaussianCloud) -> str:
-    """Return the device of the body's steps: that of ``cloud``, or the CPU if PyTorch is missing or cannot use the GPU,
-    since the matrices of a GPU are in its tensors."""
+    """Return the device on which the body's steps are computed.
+
+    It is the device of ``cloud``, or the CPU if PyTorch is missing or cannot use the GPU: on a GPU, the matrices of the
+    steps are PyTorch tensors.
+    """
     if cloud.device.is_cpu:
         return str(cloud.device)
     try:
@@ -348,7 +350,8 @@ class PlacedCage:
     frame: BodyFrame
     """Frame of the body in the capture."""
     gaussians: GaussianCloud
-    """Gaussians that define the body (``body_gaussians``), of a large capture a part (``representatives``)."""
+    """Gaussians that define the body (``body_gaussians``); in a large capture, these are a subset
+    (``representatives``)."""
     cage: Cage
     """Tetrahedral mesh around the Gaussians."""
     limbs: Limbs
@@ -372,7 +375,7 @@ def place_cage(
         plane: Ground plane in the capture.
         metres_per_unit: Length of one unit of the capture, m; None makes the body 1 m tall.
         nodes: Approximate number of cage nodes.
-        cage_file: File of the tetrahedra of the cage (``read_cage_mesh``); None makes them.
+        cage_file: File with the tetrahedra of the cage (``read_cage_mesh``); None generates them.
     """
     near, anchor = centred(representatives(cloud))
     if plane is None:
@@ -440,7 +443,7 @@ def _check_slope(normal: np.ndarray, up: np.ndarray) -> None:
 
 
 def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleSet:
-    """Return the muscles of a body: those of ``file`` (JSON, ``egs_warp.muscles.files``), otherwise automatic ones.
+    """Return the muscles of a body, from ``file`` (JSON, ``egs_warp.muscles.files``) or generated automatically.
 
     Args:
         body: The soft body.
@@ -466,7 +469,7 @@ def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleS
 def _with_overlap(body: SoftBody, limbs: Limbs, overlap: float) -> SoftBody:
     """Return ``body`` with soft parts that stick out (``CreatureOptions.overlap``).
 
-    A body that keeps the captured shape as its unloaded one (``_rest_state``) stays as it is: its parts would droop.
+    A body whose unloaded shape is the captured one (``_rest_state``) is not changed, because soft parts would droop.
     """
     if overlap == 0.0 or _keeps_shape(body, limbs):
         return body
@@ -478,7 +481,7 @@ def _with_overlap(body: SoftBody, limbs: Limbs, overlap: float) -> SoftBody:
 
 
 def _keeps_shape(body: SoftBody, limbs: Limbs) -> bool:
-    """Return True for a body on a round base, or one that lies along the ground."""
+    """Return True if the captured shape is the unloaded shape: for a body on a round base and for a lying body."""
     kind = support_kind_of(body.mesh, body.mesh.nodes[:, 2], limbs.count)
     return kind in (SupportKind.ROUND_BASE, SupportKind.LYING)
 
@@ -486,11 +489,12 @@ def _keeps_shape(body: SoftBody, limbs: Limbs) -> bool:
 def _rest_state(stepper: LocomotionStepper, limbs: Limbs) -> tuple[LocomotionStepper, BodyState, bool]:
     """Let a body come to rest in its captured shape (``settle_as_captured``).
 
-    A body on a round base, or one that lies along the ground, is soft enough to flatten where it touches the ground. It
-    keeps the captured shape as its unloaded one: captured as a round body, it would otherwise touch at a point.
+    The captured shape of a body on a round base, or of a lying body, is its unloaded shape instead: its weight then
+    flattens the body where it touches the ground. With a round shape under load, it would touch at a point only.
 
     Returns:
-        The stepper with the unloaded shape; the state at rest; and False if the body is too soft for that.
+        The stepper with the unloaded shape; the state at rest; and False if the body is too soft to stand or to come to
+        rest in its captured shape.
     """
     start = settle(stepper)
     if not _stands(stepper, start):
@@ -524,12 +528,12 @@ def checked_friction(friction: float) -> float:
 
 
 def initial_stance(creature: Creature, *, step: float | None = None, style: Style | None = None) -> Stance:
-    """Return the stance of the creature at the start, with its front ahead.
+    """Return the stance of the creature at the start, in which it faces forward.
 
     Args:
         creature: The creature.
-        step: Maximum step size, s (``solver_steps``); None is the default.
-        style: Style of jumps; None is the default.
+        step: Maximum step size, s (``solver_steps``); None uses the default.
+        style: Style of jumps; None uses the default.
     """
     body, start = creature.body, creature.start
     up = -body.gravity / np.linalg.norm(body.gravity)

@@ -21,29 +21,30 @@ from egs_warp.segmentation.connectivity import connected_parts
 Y_UP = np.array([0.0, 1.0, 0.0])
 """Up in the formats and viewers that define it."""
 _CELLS = 128
-"""Number of cells, along the size of a capture, of the grid that connects Gaussians."""
+"""Number of cells along the longest side of a capture, in the grid that defines which Gaussians are connected."""
 _FLOATER_SHARE = 0.01
 """A part with less than this share of the opacity of the largest part is a floater."""
 
 
 @dataclass(frozen=True)
 class CaptureEdits:
-    """Changes of a capture, in the order in which they are made; the default changes nothing."""
+    """Changes of a capture, in the order of their application; the default changes nothing."""
 
     box: np.ndarray | None = None
-    """(2, 3) Opposite corners; Gaussians whose means lie outside are left out. File units, as before any turn."""
+    """(2, 3) Opposite corners of a box in the frame and units of the file; Gaussians with means outside are removed."""
     drop_floaters: bool = False
-    """True to leave out small parts that are connected to nothing."""
+    """True to remove small parts that are not connected to the rest."""
     up: np.ndarray | None = None
-    """(3,) Direction that points up, and is turned to +y."""
+    """(3,) Up direction of the capture, which is rotated to +y; None leaves it as it is."""
     rotation: np.ndarray | None = None
-    """(3,) Angles in degrees, about the x axis first, then y, then z; up is turned as well."""
+    """(3,) Angles of rotations about the x axis, then y, then z, degrees; applied after the rotation of ``up``. The up
+    direction of the capture is rotated as well."""
     scale: float = 1.0
     """Factor of all lengths, positive."""
     translation: np.ndarray | None = None
-    """(3,) Displacement, in the units after scaling."""
+    """(3,) Displacement, in units of the scaled capture."""
     count: int | None = None
-    """Number of Gaussians to which neighbours are merged (``decimated``)."""
+    """Number of Gaussians that remain when neighbours are merged (``decimated``); None merges none."""
 
     def __post_init__(self) -> None:
         if not 1e-9 <= self.scale <= 1e9:
@@ -58,21 +59,21 @@ class CaptureEdits:
 
     def frame(self) -> BodyFrame:
         """Return the transform to the edited capture."""
-        # About x if that suffices, so that y-down and z-up captures keep left and right.
+        # Rotate about x if that suffices, so that y-down and z-up captures keep left and right.
         upright = Rotation.identity() if self.up is None else _shortest_turn(self.up)
         axes = (self._turn() * upright).as_matrix()
         shift = np.zeros(3) if self.translation is None else self.translation
         return BodyFrame(axes, -(shift @ axes) / self.scale, self.scale)
 
     def _turn(self) -> Rotation:
-        """Return the turn by ``rotation``, which follows that of ``up`` to +y."""
+        """Return the rotation by the angles ``rotation``, which follows the rotation of ``up`` to +y."""
         if self.rotation is None:
             return Rotation.identity()
         return Rotation.from_euler("xyz", self.rotation, degrees=True)
 
     def turned_up(self, up: np.ndarray | None, vertical_axis: int | None) -> tuple[np.ndarray | None, int | None]:
-        """Return the up direction (3,) and the vertical axis of the edited capture (``Capture``), from those of the
-        capture."""
+        """Return the up direction (3,) and the vertical axis (``Capture``) after the edits; the arguments are the
+        values before."""
         if self.up is not None:
             up, vertical_axis = Y_UP, None
         turn = self._turn()
@@ -94,7 +95,7 @@ def _shortest_turn(up: np.ndarray) -> Rotation:
 def merge_captures(captures: Sequence[Capture]) -> Capture:
     """Return one capture with the Gaussians of all ``captures`` in turn.
 
-    Lower SH degrees are filled up with zeros. A property that not all of them share (up, antialiasing) is dropped, with
+    Lower SH degrees are padded with zeros. Properties in which the captures differ (up, antialiasing) are dropped, with
     a note.
     """
     first = captures[0]
@@ -125,7 +126,7 @@ def merge_captures(captures: Sequence[Capture]) -> Capture:
 
 
 def _file_positions(capture: Capture) -> np.ndarray:
-    """(n, 3) positions with the offset, float32 without one."""
+    """Return the positions (n, 3) in the file: float64 with the offset of the capture, float32 if it has none."""
     means = capture.cloud.means.numpy()
     return means if capture.origin is None else means + capture.origin
 
@@ -158,7 +159,7 @@ def edit_capture(capture: Capture, edits: CaptureEdits) -> tuple[Capture, tuple[
     if edits.moves:
         frame = edits.frame()
         if origin is not None:
-            # The displacement belongs to the offset, which has double precision.
+            # Apply the displacement to the offset, which has double precision.
             origin = frame.points(origin)
             frame = replace(frame, origin=np.zeros(3))
             origin = origin if origin.any() else None
@@ -173,8 +174,7 @@ def edit_capture(capture: Capture, edits: CaptureEdits) -> tuple[Capture, tuple[
 
 
 def floaters(cloud: GaussianCloud) -> np.ndarray:
-    """(n,) bool, Gaussians of parts that are connected to nothing and have less than 1 % of the opacity of the largest
-    part."""
+    """Return the mask (n,) bool of floaters: connected parts with less than 1 % of the opacity of the largest part."""
     means = cloud.means.numpy().astype(np.float64)
     low, high = np.quantile(means, (0.01, 0.99), axis=0)
     size = float((high - low).max())

@@ -13,11 +13,11 @@ from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.sequence import MotionRecord
 
 MAX_END_TILT = 30.0
-"""Degrees of tilt at the end of a motion above which the body counts as fallen."""
+"""Tilt at the end of a motion above which the body is considered fallen, degrees."""
 MAX_SLIP = 0.1
-"""Largest slip of a foot, as a fraction of the stride."""
+"""Maximum slip of a foot, as a fraction of the stride."""
 _TOLERANCES = {"distance": (0.1, 0.1), "height": (0.05, 0.15), "heading_degrees": (10.0, 0.0)}
-"""Largest error of each target: body heights or degrees, and as a fraction of the target; the larger one counts."""
+"""Maximum error of each target, the larger of two: absolute, body heights or degrees, and relative to the target."""
 _UNITS = {"distance": "body heights", "height": "body heights", "heading_degrees": "degrees"}
 
 
@@ -26,9 +26,9 @@ class State(Enum):
 
     DONE = "done"
     CUT_OFF = "cut off"
-    """The requested number of frames was reached first."""
+    """The requested number of frames was reached before the motion ended."""
     GOT_UP = "got up"
-    """The body fell, which ended it, and has got up."""
+    """The body fell, which ended the motion, and got up again."""
     NOT_AS_REQUESTED = "not as requested"
     """The body ended upright, but missed its target or its time limit, or its feet slid."""
     FALLEN = "fallen"
@@ -48,7 +48,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class EndCause:
-    """Cause that ended the last motion early, if any, and what the motions are judged by."""
+    """Cause that ended the last motion early, if any, and the criteria by which the motions are judged."""
 
     fallen: str | None = None
     """Description of a fall; None if the body has not fallen."""

@@ -21,7 +21,7 @@ Y_UP = BodyFrame(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
 
 
 def chosen_frames(run: FinishedRun, *, frame: int | None, every: int) -> np.ndarray:
-    """Return the indices of the frames at 60 Hz to export: ``frame`` alone, or each ``every``-th frame.
+    """Return the indices of the frames at 60 Hz to export: only ``frame``, or each ``every``-th frame.
 
     Raises ``UserError`` if the run does not have ``frame`` or ``every`` is below 1.
     """
@@ -52,14 +52,14 @@ def export_splats(
         run: The run to export.
         out: Folder for the files; for a single ``frame`` also the name of a file with the ending of its kind.
         kind: A key of ``WRITERS``.
-        frame: Export this frame alone; negative numbers count from the end.
+        frame: Export only this frame; negative numbers count from the end.
         every: Export each ``every``-th frame.
-        degree: SH degree of the colours; None keeps that of the capture.
+        degree: SH degree of the colours; None keeps the degree of the capture.
         quiet: Show no progress bar.
 
     Raises:
-        UserError: The run does not have ``frame``, ``out`` has other frames, or is a file of another kind, of several
-            frames or of a run.
+        UserError: The run does not have ``frame``; ``out`` contains other frames, or is the name of a file although
+            several frames are exported; its ending belongs to another kind; or it is a file of a run.
     """
     write = WRITERS[kind]
     frames, target = chosen_frames(run, frame=frame, every=every), Path(out)

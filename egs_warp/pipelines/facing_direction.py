@@ -25,11 +25,12 @@ _VIEWS = 24
 _SIDE, _COARSE_SIDE = 128, 64
 """Side of the pictures, pixels, for detail and for symmetry."""
 _ELEVATION = 0.2
-"""Ratio of the vertical to the horizontal component of the direction from the body to the camera."""
+"""Vertical component divided by the horizontal component of the direction from the body to the camera."""
 _FOV_DEGREES = 20.0
 """Vertical field of view, narrow so that images of a mirrored body are nearly mirrored."""
 _MAX_GAUSSIANS = 50_000
-"""Maximum number of Gaussians; a subset of more is used and widened, because small details do not matter."""
+"""Maximum number of rendered Gaussians. Of a larger cloud, a subset with enlarged splats is rendered, because small
+details do not matter."""
 _FINE, _SMOOTH = 0.01, 0.04
 """Standard deviations of two blurs, body heights: detail is the difference between them."""
 _OFFSETS = np.arange(-6.0, 7.0, 1.5)
@@ -39,20 +40,20 @@ _OPAQUE = 0.8
 _SILHOUETTE = 0.5
 """Weight of the coverage relative to the colours, 0 to 1."""
 _HIGH, _TOP, _LOW = 0.7, 0.85, 0.3
-"""Heights above which the upper part and the top are, and below which the feet are, body heights. The upper part of an
-animal on four legs is mostly its trunk, the top is its head."""
+"""Lower limits of the upper part and of the top, and upper limit of the feet: heights above the ground, body heights.
+The upper part of an animal on four legs is mostly its trunk, the top is its head."""
 _MAX_HEAD_ASPECT = 2.7
-"""Ratio of width to depth above which an upper part is a plate."""
+"""Ratio of width to depth above which an upper part is considered a plate."""
 _SYMMETRY, _LEAN, _TOP_LEAN, _PHOTOS = 2.0, 1.5, 1.0, 1.0
-"""Weights of the symmetric fraction of a picture, of leans of the upper part and of the top by one body height, and of
-photos that are all from one direction; the weight of detail is 1."""
+"""Weights of the terms of a direction's score: symmetry, lean of the upper part and of the top (body heights), and mean
+direction to the photos. The weight of the log ratio of detail in front to detail behind is 1."""
 _CLEAR_MARGIN = 0.4
-"""Difference between the scores of front and alternative above which a result is clear; 1.5 times the detail gives
-it."""
+"""Difference between the scores of front and alternative above which a result is clear. It corresponds to a front with
+1.5 times the detail of the back."""
 _MIN_SYMMETRY = 0.1
-"""Smallest difference between the symmetry about the best plane and the median over all planes of a clear result."""
+"""Minimum excess of the symmetry about the best plane over the median of all planes for a clear result."""
 _MIN_APART = np.radians(60.0)
-"""Smallest angle between the front and its alternative."""
+"""Minimum angle between the front and its alternative, radians."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Front:
     """(3,) Unit vector along the ground, the next best direction of an estimate that is not clear."""
 
     def description(self, frame: BodyFrame) -> str:
-        """Return one line for the user; ``frame`` is that of the body in the capture."""
+        """Return one line for the user; ``frame`` is the frame of the body in the capture."""
         direction, alternative = (
             None if vector is None else ",".join(f"{x:.2f}" for x in frame.axes.T @ vector)
             for vector in (self.direction, self.alternative)
@@ -111,8 +112,8 @@ def find_front(
     if lengthwise:
         angle = np.arctan2(*(np.sign(along[best]) * length)[::-1])
     else:
-        # The maximum of a parabola through the best score and its neighbours. The lean of the top only selects a
-        # direction: a head may be turned.
+        # Refine to the maximum of a parabola through the best score and its neighbours. The lean of the top selects a
+        # direction but does not refine it, because a head may be turned.
         before, at, after = score[best - 1], score[best], score[(best + 1) % len(score)]
         offset = 0.5 * (before - after) / min(before - 2.0 * at + after, -1e-12)
         angle = angles[best] + np.clip(offset, -1.0, 1.0) * np.pi / _VIEWS
@@ -219,10 +220,10 @@ def _detail(picture: np.ndarray, height: float) -> float:
 
 
 def _lean(mesh: TetMesh, above: float) -> np.ndarray:
-    """Return the horizontal offset (2,) of the part that is higher than ``above`` from the feet, body heights.
+    """Return the horizontal offset (2,) from the feet to the upper part, body heights.
 
-    If that part is a thin plate that is offset across its plane, such as the back of a chair, return only the offset
-    across the plate, negated.
+    The upper part is higher than ``above`` body heights. If it is a thin plate that is offset mainly perpendicular to
+    itself, such as the back of a chair, return the perpendicular offset, negated.
     """
     middles, volumes, height = mesh.nodes[mesh.tets].mean(axis=1), mesh.volumes(), float(mesh.nodes[:, 2].max())
 

@@ -35,9 +35,9 @@ from egs_warp.render.shadow import ContactShadow, shadow_blur_radius
 from egs_warp.short_repr import short_repr
 
 SHEET_FRAMES = 12
-"""Frames on the contact sheet."""
+"""Number of frames on the contact sheet."""
 SPLIT_KEY_FRAMES = 24
-"""Frames whose deformation decides which Gaussians are split."""
+"""Number of frames whose deformation decides which Gaussians are split."""
 _BELOW_GROUND = 0.005
 """Depth below flat ground, body heights, from which the Gaussians of a capture without a scene are hidden."""
 
@@ -51,11 +51,11 @@ class Film:
     file: str
     """Name of the video in the folder of the run."""
     deformer: Deformer
-    """Deformer of the Gaussians after splitting; of all of them, also if fewer were drawn."""
+    """Deformer of all Gaussians after splitting, even if only a subset of them was drawn."""
     camera: Camera
-    """Camera of the film; for a moving camera, the fixed one that it is derived from."""
+    """Fixed camera of the film, from which a moving camera is derived."""
     milliseconds: dict[str, list[float]]
-    """ms of each frame, by stage; the time of the splitting is divided by the number of frames."""
+    """Time of each frame by stage, ms; the time of the splitting is distributed over all frames."""
 
     @property
     def splats(self) -> GaussianCloud:
@@ -72,7 +72,7 @@ class Frame:
     shade: wp.array | None
     """(H, W) float32 opacity of the shadow; None unless the shot is transparent."""
     milliseconds: tuple[float, float]
-    """ms to deform and to render."""
+    """Times of deforming and of rendering, ms."""
 
     def picture(self) -> np.ndarray:
         """Return the image (H, W, 3) uint8; for a transparent shot (H, W, 4) with straight alpha."""
@@ -107,11 +107,11 @@ def draw_film(
         size: Width and height of the video, pixels, if ``shot`` has no size.
         shot: Camera, size, frame rate and background colour.
         background: Gaussians behind the object, in the capture's frame and units; None draws a plain floor.
-        view_from: (3,) direction from the object to the camera, in the capture's frame; of several (n, 3) the best is
-            chosen.
+        view_from: Direction (3,) from the object to the camera, in the capture's frame; the best is chosen from several
+            directions (n, 3).
         shadow: Draw a shadow on the ground.
-        light: Main light, in the axes of the capture, by which the creature is relit and casts its shadow; None keeps
-            the captured colours, and the shadow is straight below the creature.
+        light: Main light in the axes of the capture, which relights the creature and casts its shadow; None keeps the
+            captured colours and draws the shadow straight below the creature.
         max_gaussians: Draw only the most visible Gaussians of the creature, at most this many; None draws all.
         quiet: Show no progress bar.
     """
@@ -177,7 +177,7 @@ def split_deformer(performance: SimulatedRun, *, in_scene: bool = False) -> Defo
     keys = simulation.frames[:: max(1, len(simulation.frames) // SPLIT_KEY_FRAMES)]
     embedding = embed_gaussians(cloud, creature.cage.mesh)
     if not in_scene and trajectory.ground_coefficients.size == 0:
-        # Haze of the captured ground, which would be seen below the creature in the air.
+        # Hide haze of the captured ground, which would be visible below the creature in the air.
         cloud = hidden_below(cloud, GROUND, margin=_BELOW_GROUND * trajectory.height)
     split = split_for_motion(cloud, embedding, [trajectory.positions[step] for step in keys])
     return Deformer(split.cloud, split.embedding)
@@ -194,7 +194,7 @@ def drawn_frames(
     shadow: bool = True,
     light: MainLight | None = None,
 ) -> Iterator[Frame]:
-    """Render one frame for each step of the trajectory. The backdrop is reused while the camera stays the same.
+    """Render one frame for each of the ``steps``. The backdrop is reused while the camera stays the same.
 
     Args:
         deformer: Deforms the Gaussians with the cage.
@@ -208,7 +208,7 @@ def drawn_frames(
     """
     path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
     grain, device = shadow_blur_radius(deformer.rest), deformer.rest.device
-    # Below the level of uneven ground, whose shape is not drawn, the creature is visible.
+    # The shape of uneven ground is not drawn, so its plane must not hide a creature in a hollow.
     is_flat = trajectory.ground_coefficients.size == 0
     relighter = None if light is None else Relighter(deformer.rest, light)
     setting: Backdrop | None = None
@@ -240,7 +240,7 @@ def _rendered(
 
 
 def picture_seconds(creature: Creature, *, size: tuple[int, int], shadow: bool = True) -> float:
-    """Return the measured time of drawing the creature at rest on a plain floor, s.
+    """Measure the time to draw the creature at rest on a plain floor, s.
 
     Args:
         creature: The creature.
@@ -299,7 +299,7 @@ def _backdrop_of(
         camera: Camera of the frame.
         scene: Gaussians behind the creature, in the frame of the body.
         shot: Background colour and transparency.
-        grain: Blur radius of the shadow.
+        grain: Blur radius of the shadow, m.
         shadow: Draw a shadow on the ground.
         light: Main light, in the axes of the body; None for a shadow straight down.
         device: Warp device.

@@ -1,4 +1,4 @@
-"""Word to the user about a film that takes longer than its simulation, while there is time to choose a preview."""
+"""Note to the user if the film will take longer than its simulation, early enough to choose a preview instead."""
 
 from __future__ import annotations
 
@@ -8,20 +8,23 @@ from collections.abc import Callable
 from tqdm import tqdm
 
 _FIRST_FRAMES = 10
-"""Simulated frames after which the pace of the simulation is known."""
+"""Number of simulated frames after which the speed of the simulation is known."""
 _SETUP_FRAMES = 2
-"""Simulated frames that are not counted, because the first steps may compile kernels."""
+"""Number of initial frames that are not timed, because the first steps may compile kernels."""
 
 
 class FilmTimeNote:
-    """Compares the pace of a simulation with that of its film; ``update`` takes the progress of ``simulate``."""
+    """Comparison of the measured time of a simulation with the expected time of its film.
+
+    ``update`` is a ``progress`` callback of ``simulate``.
+    """
 
     def __init__(self, picture_seconds: float, pictures_per_frame: float, show_note: Callable[[str], object]) -> None:
         """Create the comparison.
 
         Args:
             picture_seconds: Time of drawing one picture, s.
-            pictures_per_frame: Pictures of the film for each simulated frame.
+            pictures_per_frame: Number of pictures of the film for each simulated frame.
             show_note: Called with the note, at most once.
         """
         self._seconds = picture_seconds * pictures_per_frame
@@ -29,7 +32,7 @@ class FilmTimeNote:
         self._started = 0.0
 
     def update(self, done: int, expected: int) -> None:
-        """Show the note once the pace is known, if the film will take longer.
+        """Show the note as soon as the speed of the simulation is known, if the film will take longer.
 
         Args:
             done: Number of finished frames.

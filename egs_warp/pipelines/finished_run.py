@@ -59,7 +59,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """Files of a finished run."""
+    """Contents of the folder of a finished run."""
 
     __repr__ = short_repr
 
@@ -112,7 +112,7 @@ class FinishedRun:
 
     @cached_property
     def steps(self) -> np.ndarray:
-        """(n,) Step that is nearest to each frame at 60 Hz."""
+        """(n,) Index of the state that is nearest to each frame at 60 Hz."""
         return nearest_steps(self.trajectory.time, FRAME_RATE)
 
     def frame_number(self, frame: int, *, argument: str) -> int:
@@ -132,7 +132,7 @@ class FinishedRun:
         return TetMesh(self.trajectory.rest_positions, self.trajectory.tets)
 
     def deformer(self) -> Deformer:
-        """Create the deformer that moves the creature's Gaussians to node positions, as the film did."""
+        """Create the deformer with which the film maps node positions to the creature's Gaussians."""
         return Deformer(self.creature.splats, embed_gaussians(self.creature.splats, self.mesh))
 
     def scene_without_shadow(self) -> GaussianCloud | None:

@@ -1,4 +1,4 @@
-"""Test whether a body ends on captured ground: the simulated ground is infinite, a captured table is not."""
+"""Test whether a body ends on captured ground. The simulated ground is infinite, but a captured table has edges."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from egs_warp.geometry.height_field import HeightField
 _GROUND_DISTANCE = 0.05
 """Distance from the ground within which nodes stand on it and Gaussians belong to it, body heights."""
 _COVER_DISTANCE = 0.03
-"""A node is over ground if a ground Gaussian is within this distance, body heights, or within twice its own width."""
+"""Horizontal distance to a ground Gaussian within which a node is over ground: body heights, or twice the width of the
+Gaussian if that is larger."""
 _MIN_SHARE = 0.5
-"""Fraction of the standing nodes that must be over ground."""
+"""Minimum fraction of the standing nodes that must be over ground."""
 _MIN_OPACITY = 0.3
 """Minimum opacity of a ground Gaussian."""
 

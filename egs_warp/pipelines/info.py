@@ -43,20 +43,20 @@ if TYPE_CHECKING:
 _SIDE = 480
 """Width and height of a picture of the capture, pixels."""
 _NEAR_GROUND = 0.01
-"""Body heights below which a node at rest touches the ground."""
+"""Height above the lowest node below which a node at rest touches the ground, body heights."""
 _MAX_GAP = 0.05
-"""Body heights over the ground from which a body is not measured."""
+"""Distance above the ground, body heights; a body farther above is rejected."""
 _PALE = 0.82
-"""Grey of parts that are not limbs."""
+"""Grey value of parts that are not limbs, 0 to 1."""
 _LINE = 68
-"""Characters in a line of the picture."""
+"""Number of characters per line of the picture."""
 _MARGIN = 16
 """Margin around the capture, pixels."""
 
 
 @dataclass(frozen=True)
 class BodyInfo:
-    """Properties of a capture in the frame of its body, metres; at rest, before it is deformed by its weight."""
+    """Properties of a capture before its weight deforms it; metres, in the frame of the body."""
 
     source: str
     count: int
@@ -72,13 +72,14 @@ class BodyInfo:
     notes: tuple[str, ...]
 
     def soles(self) -> np.ndarray:
-        """Return the centres of the soles (feet, 3) m, forward, left and up of the centre of mass on the ground."""
+        """Return the centres of the soles (feet, 3), m: forward, left and up from the centre of mass's projection onto
+        the ground."""
         local = self.place.ground.local(self.place.standing)
         return np.array([local[foot.sole].mean(axis=0) for foot in self.feet]).reshape(-1, 3)
 
     @cached_property
     def parts(self) -> tuple[BodyPart, ...]:
-        """Head and branches, which keys may name (``parts_of_body``)."""
+        """Head and branches, to which keyframes may refer by name (``parts_of_body``)."""
         return tuple(
             part for part in parts_of_body(self.place) if part.name == "head" or part.name.startswith("branch")
         )
@@ -139,7 +140,7 @@ class BodyInfo:
         return dict(Counter(self.muscles.fibre_kinds[fibre] for fibre in self.muscles.fibre_from_segment))
 
     def stands(self) -> str:
-        """Return what the body stands on, for the user."""
+        """Return a description of the support on which the body stands, for the user."""
         if self.base is SupportKind.FEET:
             return f"{len(self.feet)} feet, numbered anticlockwise from straight ahead"
         return {
@@ -178,19 +179,20 @@ def inspect_capture(
     notes: tuple[str, ...] = (),
     progress: Callable[[str], object] = lambda stage: None,
 ) -> BodyInfo:
-    """Determine the properties that ``make_creature`` finds in a capture, without the simulation that lets it stand,
-    unless muscles of a file are checked (``balance_note``).
+    """Determine the properties that ``make_creature`` finds in a capture.
+
+    The body is not simulated, unless muscles of a file are to be checked (``balance_note``).
 
     Args:
         cloud: The capture.
         source: Name of the capture.
         up: (3,) Up in the capture's frame.
-        plane: Ground plane in the capture's frame; None finds the base of the object.
+        plane: Ground plane in the capture's frame; None uses the base of the object.
         front: (3,) Facing direction in the capture's frame; None estimates it.
         metres_per_unit: Length of one unit of the capture, m; None makes the body 1 m tall.
         muscles_file: Muscles (``body_muscles``); None creates automatic ones.
         nodes: Approximate number of cage nodes.
-        notes: Notes to append to.
+        notes: Notes for the user, to which others are appended.
         progress: Called with the name of each stage as it starts.
 
     Raises:
@@ -243,7 +245,7 @@ _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b", "#
 
 
 def draw_info(path: Path, info: BodyInfo) -> None:
-    """Write a picture (.png): the capture from the front and its left, its limbs, muscles and feet, and ``lines``.
+    """Write a picture (.png): views of the capture from front and left, its limbs, muscles and feet, and ``lines``.
 
     Raises ``UserError`` if ``path`` cannot be written.
     """
@@ -266,7 +268,7 @@ def draw_info(path: Path, info: BodyInfo) -> None:
 
 
 def _draw_capture(axes: Axes, info: BodyInfo, view: np.ndarray) -> None:
-    """Draw the capture seen from ``view`` (2,), forward and left, with feet, height and front over it."""
+    """Draw the capture, seen from the direction ``view`` (2,) (forward, left), and mark its feet, height and front."""
     ground, nodes, height = info.place.ground, info.place.standing, info.body.height
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
     direction = np.array([*view, 0.12]) / np.hypot(1.0, 0.12) @ ground.axes
@@ -358,7 +360,7 @@ def _arrow(axes: Axes, line: np.ndarray, text: str) -> None:
 
 
 def _three_quarters(info: BodyInfo) -> np.ndarray:
-    """Return the axes (3, 3) right, up and towards the viewer of a view from the front left."""
+    """Return the axes (3, 3) of a view from the front left: right, up and towards the viewer."""
     eye = np.array([0.8, 0.6, 0.35])
     eye /= np.linalg.norm(eye)
     right = np.cross([0.0, 0.0, 1.0], eye)

@@ -24,21 +24,21 @@ RunSummary: TypeAlias = tuple[Report, np.ndarray, Trajectory]
 
 @dataclass(frozen=True)
 class Job:
-    """Arguments of one run: those of ``simulate``, under the same names, and the friction of the ground."""
+    """Arguments of one run: arguments of ``simulate``, under the same names, and the friction of the ground."""
 
     __repr__ = short_repr
 
     motion: Script
     friction: float | None = None
-    """Coulomb coefficient of the ground (``Creature.with_friction``); None keeps the creature's."""
+    """Coulomb coefficient of the ground (``Creature.with_friction``); None keeps the friction of the creature."""
     frames: int | None = None
-    """Frames at 60 Hz, the first at rest; None runs until the body has come to rest."""
+    """Number of frames at 60 Hz, the first at rest; None simulates until the body has come to rest."""
     max_seconds: float | None = None
-    """Time limit of the motion, s; None is the motion's own limit."""
+    """Time limit of the motion, s; None uses the motion's own limit."""
     step: float | None = None
-    """Maximum step size, s; None is the default."""
+    """Maximum step size, s; None uses the default."""
     style: Style | None = None
-    """Style of jumps; None is the default."""
+    """Style of jumps; None uses the default."""
     pushes: tuple[Push, ...] = ()
     """Pushes during the run."""
     get_up: bool = True
@@ -80,7 +80,7 @@ class Job:
         return report, simulation.frames, simulation.trajectory
 
     def _requested_options(self) -> dict[str, JsonValue]:
-        """Return the requested options, ``asked`` of the report."""
+        """Return the requested options for the entry ``asked`` of the report."""
         return {
             "friction": self.friction,
             "frames": self.frames,

@@ -1,4 +1,4 @@
-"""Location of the plane under the object of a scene, and of the object on it."""
+"""Location of the ground plane under the object of a scene, and of the object on it."""
 
 from __future__ import annotations
 
@@ -28,25 +28,26 @@ from egs_warp.segmentation.table_top import planes_below, surface_around
 from egs_warp.segmentation.votes import votes_of_masks
 
 _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
-"""Degrees. At grazing angles, splats in front hide those behind, and the floor appears too high."""
+"""Elevations of the cameras, degrees. At grazing angles, splats in front hide the splats behind them, and the floor
+appears too high."""
 _MIN_SUPPORT = 0.1
-"""Fraction of the visible surface above which a plane is not a coincidence."""
+"""Minimum fraction of the visible surface on the widest plane for its normal to define up."""
 _MAX_TILT, _MAX_TILT_OF_CAMERAS = 25.0, 10.0
-"""Maximum tilt of a level plane against an up direction that is guessed or given, and against one that follows from
-many cameras. The second is small because a white desk without features is reconstructed as haze, to which planes of
-any tilt can be fitted.
+"""Maximum tilt of a level plane, degrees: relative to a guessed or given up direction, and relative to one that follows
+from many cameras. The second is small because a white desk without features is reconstructed as haze, to which planes
+of any tilt can be fitted.
 """
 _LEVEL_TOLERANCE, _MIN_TILT_DIFFERENCE = 5.0, 1.0
-"""Tilt above which a plane is uncertain, and difference of tilt by which a replacement must be better."""
+"""Tilt above which a plane is uncertain, and minimum reduction of the tilt by a replacement, degrees."""
 _TOP = 0.995
-"""Quantile of the Gaussians' heights that is the height of the object."""
+"""Quantile of the heights of the Gaussians that defines the height of the object."""
 _MAX_TABLE_DISTANCE = 0.7
-"""Maximum distance from a point down to a table top, as a fraction of its distance to the wide plane."""
+"""Maximum height of a point above a table top, as a fraction of its height above the wide plane."""
 _MIN_SURROUNDING_SHARE = 0.25
-"""Fraction of an object's surroundings in which its support must continue. Horizontal parts of real objects reach
-about 0, the cloth on the narrow table of the bonsai scene reaches 0.4."""
+"""Minimum fraction of an object's surroundings that its support must cover. Horizontal parts of the object itself cover
+about 0; the cloth on the narrow table of the bonsai scene covers 0.4."""
 _MAX_HOVER = 0.25
-"""Fraction of its size by which an object may hang above the only plane below it."""
+"""Maximum height of an object above the only plane below it, as a fraction of the object's size."""
 _PLANE_SIDE = 400
 """Longer side of the pictures to which the plane is fitted, pixels."""
 
@@ -68,7 +69,7 @@ class LocatedPlane:
     ground: HeightField | None = None
     """Measured ground; None if it is flat."""
     in_sight: bool = True
-    """True if views show the support of the object; otherwise the plane was placed under it."""
+    """False if the plane was placed under the object because the views do not show its support."""
 
     def known(self) -> PlaneRecord:
         """Return the record for ``plane.json``."""
@@ -89,18 +90,18 @@ def locate_plane(
     up: np.ndarray | None = None,
     plane: Plane | None = None,
 ) -> LocatedPlane:
-    """Find the plane under the object, and the object on it.
+    """Find the plane under the object, and segment the object on it.
 
     A coarse plane is estimated from the Gaussians (a table top has priority over a wider floor), and the object is
     segmented on it. The plane is then fitted to the depth rendered around the object, through ``cameras`` or a ring of
-    steep views, and the object is segmented again. If many cameras define up and the fitted plane is not level, as over
-    a white desk without features, the plane is placed under the object's lowest parts instead.
+    steep views, and the object is segmented again. If many cameras define up and the fitted plane is not level, as can
+    happen with a white desk without features, the plane is placed under the object's lowest parts instead.
 
     Args:
         cloud: The capture.
         spec: Specification of the object.
         cameras: Cameras of the capture, if known.
-        up: (3,) Approximate up; None is that of the file (``Capture.up``), else estimated.
+        up: (3,) Approximate up direction; None uses the one in the file (``Capture.up``), or else an estimate.
         plane: The plane, if known; then only the object is segmented.
 
     Raises:
@@ -155,7 +156,7 @@ def locate_plane(
 
 
 def _fallback_plane(cloud: GaussianCloud, spec: ObjectSpec, plane: Plane, notes: tuple[str, ...]) -> LocatedPlane:
-    """Return the object on a ``plane`` that was placed under its lowest parts."""
+    """Segment the object on a ``plane`` that was placed under its lowest parts."""
     segmentation = remove_foot_remnants(cloud, plane, segment(cloud, plane, spec, hover=_MAX_HOVER))
     where = _describe_plane(plane)
     note = f"{where}: laid under the object's lowest parts, because no view shows where the ground is; see plane.png"
@@ -237,7 +238,7 @@ def _middle(cloud: GaussianCloud, segmentation: Segmentation) -> np.ndarray:
 
 
 def up_of_cameras(cameras: Sequence[Camera]) -> np.ndarray | None:
-    """Return the up direction (3,) of ``cameras`` that photographers hold upright; None if they do not define one."""
+    """Return the up direction (3,), assuming that the ``cameras`` were held upright; None if they do not define one."""
     if len(cameras) < 3:
         return None
     # The image x axes span the level plane.
@@ -250,10 +251,10 @@ def up_of_cameras(cameras: Sequence[Camera]) -> np.ndarray | None:
 
 
 def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray, str, float]:
-    """Estimate up.
+    """Estimate the up direction.
 
     Returns:
-        (3,) up, the reason for it, and the maximum tilt of a level plane against it, degrees.
+        The up direction (3,), the reason for it, and the maximum tilt of a level plane relative to it, degrees.
     """
     up = up_of_cameras(cameras)
     if up is not None:
@@ -263,10 +264,9 @@ def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray,
 
 
 def _standing(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, tilt: float) -> tuple[Plane, Segmentation]:
-    """Return a coarse plane and the object on it.
+    """Return a coarse plane and the segmentation of the object on it.
 
-    The plane is the wide plane of the capture that is under the object, or a higher one that is visible only around
-    the object, such as a table top.
+    The plane is the wide plane under the object, or a higher one that surrounds the object, such as a table top.
     """
     everywhere = find_planes(cloud, up, tilt_degrees=tilt)
     segmentation, wide, failure = None, None, None
@@ -296,7 +296,7 @@ def _standing(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, tilt: floa
 
 
 def _level(up: np.ndarray, everywhere: Sequence[FoundPlane]) -> np.ndarray:
-    """Return the normal (3,) of the widest plane if it is wide, otherwise ``up``: supports are level."""
+    """Return the normal (3,) of the widest plane if it is wide enough, otherwise ``up``. Supports are level planes."""
     return everywhere[0].plane.normal if everywhere and everywhere[0].support > _MIN_SUPPORT else up
 
 
@@ -336,7 +336,7 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everyw
 
 
 def _lowest_point(spec: ObjectSpec, up: np.ndarray) -> np.ndarray | None:
-    """Return the lowest (3,) of the point and the clicks on the object, None without a point."""
+    """Return the lowest point (3,) among the point and the clicks on the object; None if there are none."""
     if spec.point is None:
         return None
     points = [spec.point, *(click.point for click in spec.clicks if click.inside)]

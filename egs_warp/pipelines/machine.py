@@ -1,4 +1,4 @@
-"""Inspection of the machine, and compilation of all kernels ahead of time."""
+"""Inspection of the machine, and compilation of all kernels before their first use."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ OPTIONAL = {
 """Purpose of each optional package, and the extra that installs it."""
 _ENCODERS = {"libx264": "mp4", "prores_ks": "ProRes 4444", "libvpx-vp9": "WebM with alpha"}
 _MIN_FREE_MEMORY = 2**31
-"""Memory that a scene of half a million Gaussians and its body need, bytes."""
+"""Memory for a scene of half a million Gaussians and a body, bytes."""
 _BLOCK_SIZE = 256
-"""Warp's default on a GPU; a kernel file with another block size defines ``BLOCK``."""
+"""Warp's default block size on a GPU; a kernel file with another block size defines ``BLOCK``."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ class DeviceFacts:
     """Properties of one Warp device."""
 
     alias: str
-    """``cpu``, ``cuda:0``, ..."""
+    """Warp's name of the device, such as ``cpu`` or ``cuda:0``."""
     name: str
     free: int | None
     """Free memory, bytes; None if the system does not report it."""
     total: int | None
-    """Memory, bytes; None if the system does not report it."""
+    """Total memory, bytes; None if the system does not report it."""
     compiled: int
     """Number of kernel files that are in the cache, compiled for this device from the current sources."""
     files: int
@@ -70,9 +70,9 @@ class Machine:
     cache_bytes: int
     ffmpeg: str | None
     encoders: tuple[str, ...]
-    """Video formats that this ffmpeg can write."""
+    """Video formats that the installed ffmpeg can write."""
     problems: tuple[str, ...]
-    """Problems that must be solved before anything works."""
+    """Problems without whose solution nothing works."""
     advice: tuple[str, ...]
 
     def lines(self) -> list[str]:
@@ -135,9 +135,9 @@ def inspect_machine() -> Machine:
 
 
 def compile_kernels(device: str, *, progress: Callable[[str, int, int], object] = lambda name, done, of: None) -> None:
-    """Compile every kernel of the package for ``device``, except those in the cache. Call ``use_device`` first.
+    """Compile all kernels of the package for ``device`` that are not in the cache. Call ``use_device`` first.
 
-    ``progress`` is called before each file with its name, the number of finished files, and the number of files.
+    ``progress`` is called before each file with its name, the number of finished files, and the total number of files.
     """
     target: wp.Device = wp.get_device(device)
     files = _kernel_files(target)

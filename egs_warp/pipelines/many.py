@@ -45,11 +45,11 @@ class JobResult:
     report: Report | None
     """The report, as ``animate`` writes it."""
     frames: np.ndarray
-    """(n,) Index into the trajectory's times for each frame of a video at 60 Hz."""
+    """(n,) Index of the trajectory's state for each frame of a video at 60 Hz."""
     file: Path | None
-    """File of the trajectory, if a folder was given."""
+    """File of the trajectory; None if no folder was given or the job failed."""
     in_memory_trajectory: Trajectory | None
-    """The trajectory, if no folder was given."""
+    """The trajectory; None if it was written to ``file`` or the job failed."""
 
     @property
     def state(self) -> State | None:
@@ -87,11 +87,11 @@ def simulate_many(
         jobs: The jobs.
         workers: Number of processes on this machine; None uses its number of cores; ``"ray"`` or the address of a Ray
             cluster uses the cores of the cluster (docs/guide/many.md).
-        worlds: Batch size, in this process on the creature's device, of the jobs that have prescribed activations and
-            no pushes. None uses batches of up to 1,024 on a GPU if there are at least two such jobs for each core of
-            this machine. 0 uses no batches.
-        out: Folder for trajectories, ``job-0000.npz`` and so on, which are then not kept in memory.
-        ended: Called with number, from 0, and result of each job when it ends.
+        worlds: Batch size for the jobs with prescribed activations and no pushes, which can run in batches in this
+            process on the creature's device. None uses batches of up to 1,024 on a GPU if there are at least two such
+            jobs for each core of this machine. 0 uses no batches.
+        out: Folder for trajectories, ``job-0000.npz`` and so on, which are then not held in memory.
+        ended: Called when a job ends, with its number from 0 and its result.
         progress: Called after each frame with the number of finished frames and the number expected in total.
 
     Returns:
@@ -125,7 +125,7 @@ def simulate_many(
 def _run_jobs(
     creature: Creature, jobs: Sequence[Job], workers: int | str | None, worlds: int | None, counts: _FrameCounter
 ) -> Iterator[TaskResult]:
-    """Run the jobs and yield each result when it is available, those of batches first."""
+    """Run the jobs and yield each result when it is available; batches run first."""
     if worlds is not None and worlds < 0:
         raise ArgumentError("worlds", "give the number of jobs in a batch, at least 0", value=worlds)
     batched = [number for number, job in enumerate(jobs) if is_batchable(job)]
@@ -186,7 +186,7 @@ class _RunJob:
         # Send a single Gaussian in place of the capture, which no motion uses.
         dot = [np.zeros((1, *shape)) for shape in ((3,), (4,), (3,), (), (1, 3))]
         cloud = GaussianCloud.from_numpy(*dot, device=self._device)
-        # Unpickled in the worker after ``use_device``, which makes Warp quiet.
+        # The worker unpickles the creature after ``use_device``, which suppresses Warp's start message.
         self._pickled_creature: bytes = pickle.dumps(replace(creature, cloud=cloud))
         self._creature: Creature | None = None
 
@@ -200,7 +200,10 @@ class _RunJob:
 
 
 class _FrameCounter:
-    """Count of the frames of all jobs, done and expected; a job not yet started counts with the mean of the others."""
+    """Count of the finished and the expected frames of all jobs.
+
+    A job that has not started is expected to have as many frames as the mean of the others.
+    """
 
     def __init__(self, jobs: int, progress: Callable[[int, int], object]) -> None:
         self._jobs, self._progress = jobs, progress

@@ -1,4 +1,4 @@
-"""Picking of objects by hand: state, history and proposals, without the page that shows them."""
+"""Interactive picking of objects: state, history and proposals, independent of the page that shows them."""
 
 from __future__ import annotations
 
@@ -23,22 +23,23 @@ from egs_warp.segmentation.plane_search import find_planes
 from egs_warp.segmentation.table_top import planes_below, surface_around
 
 _MIN_SUPPORT = 0.15
-"""Share of the visible surface below which the widest plane is not taken for the ground of a scene."""
+"""Minimum share of the visible surface on the widest plane for it to be the ground of a scene."""
 _MAX_BELOW = 0.3
-"""Share of the opaque Gaussians above which a plane has too much below it to be the ground."""
+"""Maximum share of the opaque Gaussians that may be below the ground."""
 _STANDING = 0.03
-"""Height above the ground, as a fraction of the capture's, from which Gaussians stand on it."""
+"""Height above the ground above which Gaussians belong to objects on it, as a fraction of the capture's height."""
 _MAX_TABLE_DISTANCE, _MIN_SURROUNDING_SHARE = 0.7, 0.25
-"""A table top replaces the wide plane if the click is nearer to it than this multiple, and if this share of the
-object's surroundings lies on it, as in ``locate_plane``."""
+"""Conditions, as in ``locate_plane``, for a table top to replace the wide plane: maximum height of the click above the
+table top, as a fraction of its height above the wide plane, and minimum share of the object's surroundings on the table
+top."""
 _MAX_SHARE = 1.0 / 3.0
-"""Share of the capture above which an object is reported as large, if it is also wide."""
+"""Share of the capture's Gaussians above which an object is reported as large, if it is also wide."""
 _MAX_EXTENT = 0.6
-"""Fraction of the capture's diagonal along the ground above which an object is wide."""
+"""Ratio of an object's diagonal along the ground to the capture's above which the object is wide."""
 _VIEWS, _SIDE = 6, 160
-"""Number of cameras, and longer side in pixels, in which the edges of the pictures are tested."""
+"""Number of pictures whose edges are tested, and their longer side in pixels."""
 _SEED_COUNT = 8
-"""Number of Gaussians next to the middle of a scene from which the proposal starts."""
+"""Number of Gaussians nearest to the middle of a scene from which the proposal starts."""
 _OPAQUE = 0.3
 MAX_STEPS = 100
 """Maximum number of changes that can be undone."""
@@ -46,22 +47,22 @@ MAX_STEPS = 100
 
 @dataclass(frozen=True)
 class Pick:
-    """One object: what the user has marked, and what follows from it."""
+    """One object: the user's marks and the Gaussians that they select."""
 
     name: str
     plane: Plane
-    """Ground of the object."""
+    """Ground plane under the object."""
     mask: np.ndarray
-    """(n,) bool, its Gaussians."""
+    """(n,) bool, True for the Gaussians of the object."""
     clicks: tuple[Click, ...] = ()
     front: np.ndarray | None = None
     """(3,) facing direction that the user has given; None to estimate it."""
     proposal: np.ndarray | None = None
-    """(n,) bool, Gaussians from which the clicks start: those of a file, or of a proposal; None for none."""
+    """(n,) bool, initial selection that the clicks change, from a file or a proposal; None for an empty one."""
     is_guess: bool = False
     """True if the proposal is a guess, which a click elsewhere replaces."""
     is_plane_given: bool = False
-    """True if the user has put the plane where it is."""
+    """True if the user has set the plane."""
 
     @property
     def points(self) -> np.ndarray:
@@ -71,7 +72,7 @@ class Pick:
 
 @dataclass(frozen=True)
 class PickState:
-    """All objects at one time."""
+    """All objects and the active one at one point of the history."""
 
     picks: tuple[Pick, ...]
     active: int = 0
@@ -86,7 +87,7 @@ class PickState:
         return replace(self, picks=(*self.picks[: self.active], pick, *self.picks[self.active + 1 :]))
 
     def with_new(self, pick: Pick) -> PickState:
-        """Return the state with a further object, which becomes the active one."""
+        """Return the state with an additional object, which becomes the active one."""
         return PickState((*self.picks, pick), len(self.picks))
 
     def selecting(self, index: int) -> PickState:
@@ -102,13 +103,13 @@ class PickState:
         return PickState(rest, min(self.active, len(rest) - 1))
 
     def free_name(self) -> str:
-        """Return a name for a new object."""
+        """Return an unused name for a new object."""
         names = {one.name for one in self.picks}
         return next(f"object {number}" for number in range(1, len(names) + 2) if f"object {number}" not in names)
 
     def labels(self) -> np.ndarray:
-        """(n,) uint8, number of the object of each Gaussian, from 1; 0 for the rest. The active object has
-        precedence."""
+        """Return the labels (n,) uint8: the number from 1 of the object to which a Gaussian belongs, 0 for none. The
+        active object has precedence."""
         labels = np.zeros(len(self.pick.mask), np.uint8)
         for number, one in enumerate(self.picks, start=1):
             labels[one.mask] = number
@@ -143,7 +144,7 @@ class PickHistory:
         self._at = len(self._states) - 1
 
     def amend(self, state: PickState) -> None:
-        """Replace the current state without a step of its own."""
+        """Replace the current state, so that undo and redo do not see the change as a separate step."""
         self._states[self._at] = state
 
     def move(self, *, redo: bool) -> bool:
@@ -157,7 +158,7 @@ class PickHistory:
 def stroke_at(
     cloud: GaussianCloud, camera: Camera, pixels: Sequence[tuple[float, float]], *, inside: bool
 ) -> Click | None:
-    """Return the click whose hits are those of all ``pixels`` of ``camera``'s picture; None if nothing is there."""
+    """Return one click with the hits at all ``pixels`` of ``camera``'s picture; None if no pixel shows a Gaussian."""
     clicks = [click_at(cloud, camera, u, v, inside=inside) for u, v in pixels]
     found = [click for click in clicks if click is not None]
     if not found:
@@ -200,14 +201,14 @@ def on_table_top(graph: ClickGraph, pick: Pick) -> Pick:
 
 
 def proposed(graph: ClickGraph, up: np.ndarray, *, centre: np.ndarray | None = None) -> Pick:
-    """Return what is found without a click: the ground and the object in the middle.
+    """Return the proposal without any clicks: the ground and the object in the middle.
 
-    A capture without a wide plane below it is one object on its base.
+    A capture without a wide plane under it is considered one object on its base.
 
     Args:
         graph: the prepared capture.
         up: (3,) up direction.
-        centre: (3,) point at which the cameras look; None for the middle of what stands on the ground.
+        centre: (3,) point at which the cameras look; None uses the median of the Gaussians that stand on the ground.
     """
     cloud = graph.cloud
     opaque = cloud.opacities() > _OPAQUE
@@ -232,7 +233,7 @@ def proposed(graph: ClickGraph, up: np.ndarray, *, centre: np.ndarray | None = N
     hits = standing[np.argsort(away, kind="stable")[:_SEED_COUNT]]
     guess = resegmented(graph, replace(empty, clicks=(Click(graph.means[hits[0]], hits),)))
     if _is_large(graph, guess):
-        # Rather nothing than half of a room.
+        # Half of a room is a bad proposal.
         return empty
     return replace(guess, clicks=(), proposal=guess.mask, is_guess=True)
 
@@ -248,7 +249,7 @@ def _base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
 
 
 def size_of(graph: ClickGraph, pick: Pick) -> float:
-    """Return the diagonal of the object's bounding box, without outliers; 0 without an object."""
+    """Return the diagonal of the object's bounding box without outliers, scene units; 0 for an empty object."""
     if not pick.mask.any():
         return 0.0
     low, high = np.quantile(graph.means[pick.mask], [0.005, 0.995], axis=0)
@@ -256,7 +257,7 @@ def size_of(graph: ClickGraph, pick: Pick) -> float:
 
 
 def _is_large(graph: ClickGraph, pick: Pick) -> bool:
-    """Return True if the object has a large part of the capture and is wide: it may include other things."""
+    """Return True if the object is a large and wide part of the capture, which may include other objects."""
     along = np.stack(pick.plane.tangents(), axis=1)
     extent, whole = (
         float(np.linalg.norm(np.subtract(*np.quantile(points @ along, [0.99, 0.01], axis=0))))
@@ -285,8 +286,8 @@ def pick_warnings(graph: ClickGraph, pick: Pick) -> tuple[str, ...]:
 
 
 def edge_warnings(cloud: GaussianCloud, mask: np.ndarray, cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """Return a warning with a remedy if the object ``mask`` (n,) bool of ``cloud`` touches the edges of some pictures
-    all round, as a room does."""
+    """Return a warning with a remedy if the object ``mask`` (n,) bool of ``cloud`` touches nearly all edges of a
+    picture, as a room does."""
     tested = [downscale(camera, _SIDE) for camera in cameras[:: max(1, len(cameras) // _VIEWS)]][:_VIEWS]
     all_round, _ = views_at_edges(cloud.subset(mask), tested)
     if all_round == 0:
@@ -300,8 +301,8 @@ def edge_warnings(cloud: GaussianCloud, mask: np.ndarray, cameras: Sequence[Came
 def ground_around(
     cloud: GaussianCloud, mask: np.ndarray, plane: Plane, cameras: Sequence[Camera] = ()
 ) -> HeightField | None:
-    """Return the uneven ground about the object ``mask`` (n,) bool of ``cloud``, as ``animate`` measures it; None if it
-    is flat, or if there is nothing but the object.
+    """Return the uneven ground around the object ``mask`` (n,) bool of ``cloud``, measured as for ``animate``; None if
+    it is flat, or if the capture contains only the object.
 
     Args:
         cloud: the capture.

@@ -12,8 +12,8 @@ from egs_warp.motions.sequence import MotionSequence
 def planned_com(sequence: MotionSequence, body: SoftBody, trajectory: Trajectory) -> np.ndarray:
     """Return the planned centre of mass (F + 1, 3) m, NaN in states without a plan; no rows if no motion has one.
 
-    Jumps, hops and twists have a plan from the crouch to touch-down, made before the first step; a turn in several
-    twists has only the plan of the first. The motions themselves are controlled by the measured state.
+    Jumps, hops and twists have a plan from the crouch to touch-down, which is made before the first step. A turn in
+    several twists has a plan of its first twist only. The controllers use the measured state, not this plan.
     """
     path = np.full((len(trajectory.time), 3), np.nan)
     for entry, (first, last) in zip(sequence.done, sequence.spans(trajectory.time), strict=True):

@@ -33,11 +33,12 @@ _FLOWS = {
     "restored spin": ("spin_inside", "spin_after"),
 }
 _COLOUR_PERCENTILE = 99.0
-"""Percentile of the tensions at the end of the colour scale."""
+"""Percentile of the tensions that defines the upper end of the colour scale."""
 
 
 def draw_plots(path: Path, trajectory: Trajectory, energy: EnergyBalance) -> None:
-    """Write plots of energies and flows, ground load, centre of mass with its plan, and muscle tension to ``path``."""
+    """Write the plots to ``path``: stored energies and cumulative energy flows, load on the ground, energy residual,
+    planned and simulated centre of mass, and muscle tensions."""
     # Imported here because the import takes a quarter of a second.
     from matplotlib.figure import Figure
 

@@ -27,7 +27,8 @@ from egs_warp.io.run_folder import check_run_folder, run_folder
 
 _PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 _MAX_EXHAUSTIVE = 400
-"""Number of photos above which they are matched only with their neighbours in the order of their names."""
+"""Maximum number of photos that are all matched with each other; more photos are matched only with their neighbours in
+the order of their names."""
 _NEIGHBOURS = 20
 """Number of neighbours with which a photo is matched."""
 _MIN_PHOTOS = 3
@@ -87,7 +88,7 @@ def pose_photos(
     stage: Callable[[str], None] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> PoseResult:
-    """Find the poses of the photos in a folder, or of sharp frames of a video.
+    """Determine the poses of the photos in a folder, or of sharp frames of a video.
 
     ``out`` receives ``images`` (with the EXIF rotation applied) and COLMAP's ``sparse/0``, which ``train`` reads. The
     folder belongs to one run (``egs_warp.io.run_folder``).
@@ -96,11 +97,11 @@ def pose_photos(
         source: Folder of photos, or a video.
         out: Folder of the run.
         frames: Number of frames to choose from a video.
-        max_side: Longer side of the images in which features are detected, pixels.
+        max_side: Maximum length of the longer side of the images in which features are detected, pixels.
         seed: Seed of COLMAP.
         overwrite: Move an earlier run in ``out`` aside.
-        resume: True uses the features and matches of an interrupted run with the same arguments; True and False keep
-            them if this run is interrupted; None does not keep them.
+        resume: True reuses the features and matches of an interrupted run with the same arguments. If this run is
+            interrupted, True and False save its features and matches, None deletes them.
         stage: Called with a description of each stage as it starts.
         progress: Called with the name of a stage, the number of its finished items, and their total number.
 
@@ -158,7 +159,7 @@ def pose_photos(
 
 
 def _write_model(model: Any, folder: Path, out: Path | str) -> None:
-    """Write ``model`` and read it again: on a full disk COLMAP writes a part of it without an error."""
+    """Write ``model`` and read it back, because COLMAP reports no error if a full disk truncates its files."""
     folder.mkdir(parents=True)
     model.write_binary(str(folder))
     try:
@@ -173,10 +174,10 @@ def _write_model(model: Any, folder: Path, out: Path | str) -> None:
 
 @contextmanager
 def _work_folder(folder: Path, resume: bool | None) -> Iterator[Path]:
-    """Create a temporary folder in the locked ``folder``, after removing those of killed runs.
+    """Remove temporary folders of killed runs, and create one in the locked ``folder``.
 
-    With ``resume`` True, the database of an interrupted run stays; with True or False, this folder stays if a signal
-    or a crash ends the run.
+    With ``resume`` True, the database of an interrupted run is reused. With True or False, the temporary folder remains
+    if a signal or a crash ends the run.
     """
     kept = folder / f"{_WORK_PREFIX}kept"
     for remnant in folder.glob(f"{_WORK_PREFIX}*"):
@@ -187,7 +188,7 @@ def _work_folder(folder: Path, resume: bool | None) -> Iterator[Path]:
             yield Path(work)
         return
     kept.mkdir(exist_ok=True)
-    # Photos are copied again, because the copies may be incomplete; COLMAP skips features and matches that it has.
+    # Photos are copied again, because the copies may be incomplete; COLMAP skips features and matches in its database.
     for part in ("images", "models", "sparse"):
         shutil.rmtree(kept / part, ignore_errors=True)
     try:
@@ -217,7 +218,7 @@ def _copied(source: Path, images: Path) -> tuple[str, ...]:
         if exif_orientation == 1:
             shutil.copyfile(path, target)
         else:
-            # Written without the EXIF tag, which only some programs apply.
+            # The orientation is applied to the pixels, because not all programs apply the EXIF tag.
             _write_picture(target, apply_orientation(pixels, exif_orientation), quality=97)
     return tuple(unreadable)
 
@@ -246,7 +247,7 @@ def _reconstructed(
         work: Temporary folder.
         names: Paths of the photos below ``work/images``.
         in_order: True for frames of a video, which are matched sequentially.
-        max_side: Longer side of the images in which features are detected, pixels.
+        max_side: Maximum length of the longer side of the images in which features are detected, pixels.
         seed: Seed of COLMAP.
         say: Called with a description of each stage.
         report: Called with the name of a stage, the number of its finished items, and their total number.
@@ -312,7 +313,7 @@ def _reconstructed(
 
 
 class _DatabaseWatch:
-    """Progress of pycolmap, taken from the number of rows of its database, because pycolmap does not report it."""
+    """Progress of pycolmap, measured by the number of rows in its database, because pycolmap does not report it."""
 
     def __init__(self, database: Path, report: Callable[[str, int, int], None]) -> None:
         self._database = database

@@ -43,9 +43,9 @@ _CLEARED = {
 
 
 _SOLID = 0.1
-"""Opacity above which a Gaussian counts for the lowest part of an object."""
+"""Minimum opacity of Gaussians that define the lowest part of an object."""
 _HOVER_FRACTION = 0.03
-"""Fraction of its size above which the distance of an object to its plane means that it hovers."""
+"""Distance from the plane above which an object hovers, as a fraction of the object's size."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class SceneOptions:
 
     @property
     def stages(self) -> dict[str, bool]:
-        """Stages of ``prepare_scene`` in their order. False marks a stage that is run without its training."""
+        """Stages of ``prepare_scene`` in their order; the value is False for a stage that runs without its training."""
         requested = {"plane": True, "ground": not self.flat, "segment": True, "inpaint": self.inpaint}
         whole = {"segment": self.method is StraddlingPolicy.FINETUNE, "inpaint": has_torch()}
         return {name: whole.get(name, True) for name, is_requested in requested.items() if is_requested}
@@ -91,7 +91,7 @@ class PreparedScene:
     plane: Plane
     """Ground plane under the object."""
     hole: Hole | None
-    """Hole in the floor under the object; None if the object hangs above the floor."""
+    """Hole in the floor under the object; None if the object hovers above the floor."""
     located: LocatedPlane
     """Details of the plane and of the segmentation."""
     notes: tuple[str, ...]
@@ -99,7 +99,7 @@ class PreparedScene:
     filled: InpaintResult | None = None
     """Result of the inpainting; None if there was none."""
     light: MainLight | None = None
-    """Main light of the capture; None if it is not clear."""
+    """Main light of the capture; None if its estimate is uncertain."""
 
     @property
     def ground(self) -> HeightField | None:
@@ -111,7 +111,7 @@ class PreparedScene:
 
         Args:
             out: A folder, or the folder of a run.
-            known: Records of the file that the plane was read from; facts that were not measured again are copied.
+            known: Records of the file from which the plane was read; values that were not measured again are copied.
         """
         file_path = out.file if isinstance(out, RunFolder) else out.joinpath
         write_ply(file_path("object.ply"), self.object)
@@ -138,9 +138,10 @@ def prepare_scene(
         spec: Specification of the object.
         cameras: Cameras of the capture, if known.
         photographs: Photos of the whole scene for the fine-tuning at the plane; None uses renders of the capture.
-        up: (3,) Approximate up direction, or an axis such as ``"-y"``; None is that of the file, else estimated.
+        up: (3,) Approximate up direction, or an axis such as ``"-y"``; None uses the one in the file, or else an
+            estimate.
         plane: The ground plane; None finds it.
-        options: Options; None is the default.
+        options: Options; None uses the default.
         progress: Called with the name of a stage and its finished fraction.
 
     Raises:
@@ -160,7 +161,7 @@ def prepare_scene(
     )
     object_cloud, snap_notes = snap_to_plane(object_cloud, located)
     notes = (*notes, *snap_notes)
-    # Measured before the hole is filled: the fill replaces a part of the shadow.
+    # Estimate the light before the hole is filled, because the fill replaces a part of the shadow.
     lighting = estimate_light(object_cloud, background_with_hole, located.ground or located.plane)
     notes = (*notes, lighting.note)
     filled, hole = None, hole_under(cloud, located.plane, located.segmentation)
@@ -170,7 +171,7 @@ def prepare_scene(
         notes = (*notes, "what is under the object was not filled, because no view shows where the ground is")
     elif options.inpaint and hole is not None:
         progress("inpaint", 0.0)
-        # torch may be missing, and with it the training that inpainting ends with.
+        # Import lazily: torch, which the final training of the inpainting needs, may be missing.
         from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
 
         chosen = InpaintOptions() if has_torch() else InpaintOptions(steps=0)
@@ -181,7 +182,7 @@ def prepare_scene(
             )
             notes = (*notes, *filled.notes)
         except UserError as error:
-            # A floor with a hole is acceptable; the animation must not fail because of it.
+            # A floor with a hole is acceptable, so the animation must not fail for this reason.
             notes = (*notes, f"the floor under the object was not filled ({error})")
     background = background_with_hole if filled is None else filled.cloud
     return PreparedScene(
@@ -214,7 +215,7 @@ def segment_scene(
     segmentation, method = located.segmentation, options.method
     straddling_cloud, ground = cloud.subset(segmentation.object_mask), located.ground
     if ground is not None:
-        # In coordinates in which the ground is the plane, the object can be cleared of the plane.
+        # Flatten the ground to the plane, because only a plane can be cleared from the object.
         straddling_cloud, photographs = _moved(straddling_cloud, ground.flatten), None
     heights, reach = plane_extents(straddling_cloud, located.plane, options.clearing_options.reach)
     if not segmentation.background_mask.any():
@@ -244,7 +245,7 @@ def segment_scene(
 
 
 def snap_to_plane(object_cloud: GaussianCloud, located: LocatedPlane) -> tuple[GaussianCloud, tuple[str, ...]]:
-    """Move the object down onto its plane if it hovers above it, as captures of robots may.
+    """Move the object down onto its plane if it hovers above the plane, as some captured robots do.
 
     Returns:
         The object, and a note if it was moved.
@@ -264,9 +265,9 @@ def _moved(cloud: GaussianCloud, to: Callable[[np.ndarray], np.ndarray]) -> Gaus
 
 
 def viewing_directions(scene: PreparedScene, cameras: Sequence[Camera]) -> np.ndarray | None:
-    """Return good viewing directions (n, 3), from the object to the camera; None without cameras above the plane.
+    """Return viewing directions (n, 3) from the object to cameras of the capture; None without cameras above the plane.
 
-    A capture has the best quality from its own cameras. Of these, the half with medium elevation is used.
+    A capture has the best quality in its own views. The half of the cameras with medium elevation is used.
     """
     normal, centre = scene.plane.normal, scene.located.centre
     arms = np.array([one.centre - centre for one in cameras if scene.plane.heights(one.centre) > 0.0]).reshape(-1, 3)

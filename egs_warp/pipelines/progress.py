@@ -1,6 +1,6 @@
 """Progress bars with calibrated remaining times: for scenes, ``info``, conversions, creatures, simulations and films.
 
-Inside of ``photos_bar``, all other bars report to it instead of appearing.
+Within the context of ``photos_bar``, other bars are not shown but report their progress to it.
 """
 
 from __future__ import annotations
@@ -18,34 +18,35 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 _PREPARATION_STAGES = {"cage": 0, "contact": 45, "front": 55, "body and muscles": 68, "stand": 85, "split": 95}
-"""Percent of the time that have passed when a stage starts: median of four captures on a CPU (pawn, plush dog, monkey,
-robot: within 15 of these)."""
+"""Elapsed time at the start of each stage, percent of the total: median of four captures on a CPU (pawn, plush dog,
+monkey, robot), each within 15 percentage points of it."""
 _INFO_STAGES = {"cage": 0, "front": 70, "muscles": 91}
-"""Percent of the time that have passed when a stage of ``info`` starts (pawn, plush dog, monkey, robot: within 13)."""
+"""Elapsed time at the start of each stage of ``info``, percent of the total (within 13 percentage points for the same
+four captures)."""
 _CONVERSION_STAGES = {".compressed.ply": 37, ".ply": 27, ".spz": 65, ".sog": 80, ".splat": 1, ".glb": 11}
-"""Percent of the time that have passed when the comparison after writing a capture starts (400,000 Gaussians of SH
-degree 3 on a CPU)."""
+"""Elapsed time of a conversion, percent of the total, when the file has been written and its comparison with the source
+starts; by name ending (400,000 Gaussians of SH degree 3 on a CPU)."""
 _SCENE_SHARES = {"plane": 12, "ground": 15, "segment": 49, "inpaint": 24}
-"""Percent of the time that each stage of a scene takes: median of two built-in scenes, koala and narcissus on a CPU;
-stages start within 16 of these."""
+"""Duration of each stage of a scene, percent of the total: median of two built-in scenes (koala, narcissus) on a CPU.
+The starts of the stages that follow from it deviate from the measured ones by at most 16 percentage points."""
 _PHOTOS_SHARES = {"pose": 20, "train": 50, "pick": 1, "scene": 15, "prepare": 2, "simulate": 7, "render": 5}
-"""Percent of the time that each stage from photos to a film takes on a CPU."""
+"""Duration of each stage from photos to a film on a CPU, percent of the total."""
 _UNTRAINED_SHARE = 2
-"""Percent of the time that a stage takes without its training."""
+"""Duration of a stage without its training, in the same unit as the shares above."""
 _SMOOTHING = 0.05
-"""Smoothing factor of the frame rate; small, because a frame in the air takes a third of the time of one on the ground,
-and both alternate."""
+"""Smoothing factor of the frame rate. It is small because frames in the air and on the ground alternate, and a frame in
+the air takes a third of the time."""
 _REFRESH_INTERVAL = 1.0
-"""Seconds after which a bar is drawn again, so that its times move while a stage reports nothing."""
+"""Interval at which a bar is redrawn, s, so that its times advance while a stage reports nothing."""
 _MIN_LEFT = 0.3
-"""Least remaining time of a stage, as a fraction of the time that it has taken: one that takes longer than usual does
-not end at once."""
+"""Minimum remaining time of a stage, as a fraction of its elapsed time, because a stage that takes longer than usual is
+not about to end."""
 _RELIABLE_FRACTION = 0.1
-"""Finished fraction of a stage from which its own pace counts, not its usual share."""
+"""Finished fraction of a stage from which its own speed, not its usual share, defines its remaining time."""
 _UPDATE_INTERVAL, _LOG_INTERVAL = 0.25, 10.0
-"""Seconds between two updates of ``photos_bar`` on a terminal, and in a log."""
+"""Intervals between two updates of ``photos_bar``, s: on a terminal, and in a log."""
 _outer: ContextVar[PhotosBar | None] = ContextVar("_outer", default=None)
-"""The bar to which other bars report; None if they appear themselves."""
+"""The bar to which other bars report; None if they are shown separately."""
 
 
 @contextmanager
@@ -77,7 +78,7 @@ class PhotosBar:
             self._bar.update(stage, done)
 
     def skip(self, *stages: str) -> None:
-        """Do not count stages that finished in an earlier run."""
+        """Exclude stages that an earlier run has finished."""
         self._bar.skip(stages)
 
 
@@ -97,7 +98,10 @@ def info_bar(*, quiet: bool = False, file: TextIO | None = None) -> Iterator[Cal
 
 @contextmanager
 def conversion_bar(name: str, *, quiet: bool = False, file: TextIO | None = None) -> Iterator[Callable[[str], None]]:
-    """Show a bar for a conversion to the file type of ``name`` and the comparison that follows."""
+    """Show a bar for a conversion to the file type of ``name`` and the comparison that follows.
+
+    Call the yielded function with the name of each stage as it starts.
+    """
     written = next(done for ending, done in _CONVERSION_STAGES.items() if name.lower().endswith(ending))
     with _stages("convert", {"write": 0, "compare": written}, quiet=quiet, file=file) as begins:
         yield begins
@@ -109,7 +113,7 @@ def scene_bar(
 ) -> Iterator[Callable[[str, float], None]]:
     """Show a bar on ``file`` (default stderr) for ``prepare_scene``, and yield its ``progress`` argument.
 
-    ``stages`` are those of ``SceneOptions.stages``: the value is False for a stage without its training.
+    ``stages`` is the value of ``SceneOptions.stages``.
     """
     shares = {stage: _SCENE_SHARES[stage] if whole else _UNTRAINED_SHARE for stage, whole in stages.items()}
     with _StageBar("scene", shares, quiet=quiet, file=file) as bar:
@@ -153,9 +157,9 @@ def render_bar(count: int, *, quiet: bool = False) -> Iterator[Callable[[], obje
 
 @contextmanager
 def _stages(name: str, done: Mapping[str, int], *, quiet: bool, file: TextIO | None) -> Iterator[Callable[[str], None]]:
-    """Show a bar whose stages start at ``done`` percent of the time.
+    """Show a bar whose stages start when ``done`` percent of the total time have elapsed.
 
-    The bar appears with the first stage, so that an error before it prints only one line.
+    The bar appears at the start of the first stage, so that an earlier error prints only one line.
     """
     ends = [*list(done.values())[1:], 100]
     shares = {stage: end - start for (stage, start), end in zip(done.items(), ends, strict=True)}
@@ -165,8 +169,8 @@ def _stages(name: str, done: Mapping[str, int], *, quiet: bool, file: TextIO | N
 
 @contextmanager
 def _redrawn(draw: Callable[[], object], *, quiet: bool, file: TextIO | None) -> Iterator[None]:
-    """Call ``draw`` every ``_REFRESH_INTERVAL`` from a thread if ``file`` (default stderr) is a terminal; in a log,
-    each drawing would stay."""
+    """Call ``draw`` from a thread every ``_REFRESH_INTERVAL`` if ``file`` (default stderr) is a terminal; a log would
+    contain every drawing."""
     if quiet or not (file or sys.stderr).isatty():
         yield
         return
@@ -186,8 +190,10 @@ def _redrawn(draw: Callable[[], object], *, quiet: bool, file: TextIO | None) ->
 
 
 class _StageBar:
-    """Line with the stage, the elapsed and the remaining time of a computation whose stages take known shares of the
-    time."""
+    """Progress line with the stage, the elapsed and the remaining time of a computation.
+
+    Each stage takes a known share of the total time.
+    """
 
     def __init__(self, name: str, shares: Mapping[str, float], *, quiet: bool, file: TextIO | None) -> None:
         self._name, self._shares = name, dict(shares)
@@ -223,7 +229,7 @@ class _StageBar:
         self._draw()
 
     def skip(self, stages: Sequence[str]) -> None:
-        """Do not count ``stages``."""
+        """Exclude ``stages`` from the total."""
         self._shares = {stage: share for stage, share in self._shares.items() if stage not in stages}
         self._starts = dict(zip(self._shares, accumulate(self._shares.values(), initial=0.0), strict=False))
         self._total = sum(self._shares.values())
@@ -245,10 +251,10 @@ class _StageBar:
         self._bar.set_description_str(f"{self._name}: {self._stage}, {tqdm.format_interval(elapsed)}<{remaining}")
 
     def _left(self, elapsed: float) -> float | None:
-        """Return the remaining time, s, ``elapsed`` s after the start; None if nothing is known yet.
+        """Return the remaining time, s, ``elapsed`` seconds after the start; None before it can be estimated.
 
-        The stages before this one, or the finished part of this one, give the time of a share. A stage that takes
-        longer than its share is expected to go on for some time.
+        The time per share is measured in the earlier stages, or in the finished part of the current one. A stage that
+        takes longer than its share is expected to continue for some time.
         """
         share, start = self._shares.get(self._stage, 0.0), self._starts.get(self._stage, self._total)
         spent = elapsed - self._stage_start

@@ -14,7 +14,8 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.pipelines.worker_pool import ONE_THREAD, Event, TaskFunction, attempt
 
 DEFAULT_ADDRESS = "ray"
-"""Stands for the connected Ray cluster, otherwise for the one at ``RAY_ADDRESS``, otherwise for a temporary one."""
+"""Selects the connected Ray cluster if there is one, otherwise the cluster at ``RAY_ADDRESS``, otherwise a temporary
+one."""
 _POLL_INTERVAL = 0.5
 """Interval at which the progress of the workers is read, s."""
 
@@ -74,7 +75,7 @@ class RayPool:
         self._polls: dict[Any, int] = {}
 
     def begin(self, worker: int, task: Any) -> None:
-        """Give an idle worker a task; a worker that does not exist, or was lost, is started."""
+        """Assign a task to an idle worker; a worker that does not exist, or was lost, is started."""
         if worker not in self._actors:
             self._actors[worker] = self._actor_class.remote(self._work)
         actor = self._actors[worker]
@@ -89,7 +90,7 @@ class RayPool:
         for call in ready:
             if call in self._polls:
                 worker = self._polls.pop(call)
-                # If the worker is lost, the call of its task reports this.
+                # The loss of a worker is reported by the call that runs its task.
                 with contextlib.suppress(ray.exceptions.RayError):
                     messages = ray.get(call)
                     events += [Event(worker, "progress", values) for values in messages[-1:]]

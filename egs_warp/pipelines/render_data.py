@@ -1,4 +1,4 @@
-"""``creature.npz``: Gaussians, muscles and camera of a run, from which a page can render it from any direction."""
+"""``creature.npz``: Gaussians, muscles and camera of a run, with which a page can render it from any direction."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ _CAMERA = ("rotation", "translation", "width", "height", "fx", "fy", "cx", "cy",
 class RenderData:
     """Gaussians, muscles and camera of a run; metres, in the frame of the body.
 
-    P end points, N nodes, M segments, F fibres.
+    In the shapes below, P is the number of end points, N of nodes, M of segments, and F of fibres.
     """
 
     __repr__ = short_repr
 
     splats: GaussianCloud
-    """Gaussians at rest, after splitting; embedded in the rest cage of the trajectory, they give the film's images."""
+    """Gaussians at rest, after splitting, to be embedded in the rest cage of the trajectory."""
     camera: Camera
     """Camera of the film."""
     muscle_ends: sp.csr_matrix
-    """(P, N) Matrix that gives the end points from the node positions."""
+    """(P, N) Matrix that maps node positions to end points."""
     muscle_segments: np.ndarray
     """(M, 2) int32, end points of each segment."""
     muscle_bounds: np.ndarray
-    """(M,) m, bounds of ``activations`` of the trajectory."""
+    """(M,) m, bounds of the activations of the trajectory."""
     fibre_from_segment: np.ndarray
     """(M,) int32, fibre of each segment."""
     fibre_names: tuple[str, ...]
@@ -53,7 +53,7 @@ class RenderData:
     fibre_kinds: tuple[str, ...]
     """(F,) Kind of each fibre (``FibreKind``)."""
     foot_from_node: np.ndarray
-    """(N,) int32, foot whose sole a node belongs to, -1 for other nodes."""
+    """(N,) int32, index of the foot to whose sole a node belongs, -1 for other nodes."""
     light: MainLight | None = None
     """Main light of the film, in the axes of the body; None if it was drawn without one."""
 
@@ -89,8 +89,8 @@ class RenderData:
 
         Args:
             path: The file.
-            deformer: Deformer of ``splats``. Its plan is written too, so that programs without this package can deform
-                the splats.
+            deformer: Deformer of ``splats``. Its precomputed arrays (``Deformer.plan_arrays``) are written too, so that
+                programs without this package can deform the splats.
         """
         arrays: dict[str, Any] = {name: getattr(self.splats, name).numpy() for name in ARRAYS}
         arrays["antialiased"] = np.bool_(self.splats.antialiased)
@@ -115,7 +115,7 @@ class RenderData:
 
     @classmethod
     def load(cls, path: Path, *, node_count: int, device: str | None = None) -> RenderData:
-        """Read what ``save`` wrote for a cage of ``node_count`` nodes. Raises ``UserError`` for any other file."""
+        """Read a file that ``save`` wrote for a cage of ``node_count`` nodes. Raises ``UserError`` for other files."""
         try:
             arrays = read_npz(path)
             camera: dict[str, Any] = {name: arrays[f"camera_{name}"] for name in _CAMERA}

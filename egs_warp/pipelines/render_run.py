@@ -28,9 +28,10 @@ class Show(Enum):
 
     COLOUR = "colour"
     DEPTH = "depth"
-    """Grey, white at the nearest depth of the whole film; in a PNG 16-bit millimetres, 0 outside the creature."""
+    """Depth: in a video as grey values, white at the minimum of the film; in a PNG as 16-bit millimetres, 0 outside the
+    creature."""
     ALPHA = "alpha"
-    """Grey: opacity of the creature."""
+    """Opacity of the creature as grey values."""
 
 
 def render_run(
@@ -60,8 +61,8 @@ def render_run(
         The number of frames.
 
     Raises:
-        UserError: The run does not have the frame ``hold``, ``out`` does not support ``shot``, is a folder with other
-            frames, or is a file of a run.
+        UserError: The run does not have the frame ``hold``; or ``out`` does not support the options of ``shot``, is a
+            folder with other frames, or is a file of a run.
     """
     folder = out.suffix == ""
     if not folder:
@@ -110,7 +111,7 @@ def _picture(frame: Frame, show: Show, near: float, far: float) -> np.ndarray:
 
 
 def _millimetres(frame: Frame) -> np.ndarray:
-    """Return the depth (H, W) uint16 mm, 0 where the opacity is at most 0.5."""
+    """Return the depth (H, W) uint16, mm; 0 where the opacity is at most 0.5."""
     is_opaque = frame.image.alpha.numpy() > 0.5
     return np.where(is_opaque, np.clip(np.rint(_MILLIMETRES * frame.image.depth.numpy()), 1, 65535), 0).astype(
         np.uint16

@@ -34,13 +34,13 @@ SCHEMA_VERSION = 1
 MECHANICS = ("warp-lang", "numpy", "scipy", "osqp", "pytetwild")
 """Packages on which the motion of a body depends."""
 _KEYS = {"change": "gained", "target_error": "square_miss"}
-"""Fields of ``EnergyTotals`` and ``HopOutcome`` -> their keys in the report, whose schema is fixed."""
+"""Map from fields of ``EnergyTotals`` and ``HopOutcome`` to the keys of the report, whose schema is fixed."""
 NO_METADATA = "no metadata"
-"""Version of a package that is missing, or was copied without its ``dist-info``."""
+"""Entry for a package that is missing or was copied without its ``dist-info``."""
 
 
 def versions(names: Sequence[str] = MECHANICS) -> dict[str, str]:
-    """Return the versions of this package, Python and the packages ``names``, on which the numbers depend.
+    """Return the versions of this package, of Python, and of the packages ``names``, on which results depend.
 
     An unknown version is ``NO_METADATA`` and not an error, because the caller has finished work to save.
     """
@@ -73,7 +73,7 @@ class MotionReport:
     asked: Mapping[str, float]
     """Requested values; lengths in body heights."""
     planned: DataclassInstance
-    """Plan of the motion's state machine."""
+    """Values planned by the motion's state machine."""
     reached: MotionOutcome
     """Measured values that all motions have."""
     state: State
@@ -83,7 +83,7 @@ class MotionReport:
     """Notes for the user."""
 
     def to_json(self) -> dict[str, JsonValue]:
-        """Return an element of ``motion``."""
+        """Return an element of the report's list ``motion``."""
         also = _with_keys(asdict(self.also_reached)) if self.also_reached is not None else {}
         below = also.pop("below", None)
         also |= _with_keys(below) if isinstance(below, Mapping) else {}
@@ -98,7 +98,7 @@ class MotionReport:
 
 
 def _result(motions: Sequence[MotionReport]) -> str:
-    """Return what ``motions`` of one name reached, against what was requested, and why a target was missed."""
+    """Return one text for ``motions`` of the same name: reached and requested values, and causes of missed targets."""
     values = []
     for name, unit in (("distance", " body heights"), ("height", " body heights"), ("heading_degrees", " degrees")):
         requested = {motion.asked.get(name, 0.0) for motion in motions}
@@ -109,7 +109,7 @@ def _result(motions: Sequence[MotionReport]) -> str:
     values += dict.fromkeys(gesture.text.removeprefix(f"{motions[0].name} ") for each in outcomes for gesture in each)
     values.append(f"tilt {_span([motion.reached.tilt_degrees for motion in motions], digits=0)} degrees")
     count = f" x{len(motions)}" if len(motions) > 1 else ""
-    # The state comes first in the line.
+    # Remove the state from the notes, because the line begins with it.
     notes = dict.fromkeys(note.removeprefix(f"{motion.state.value}: ") for motion in motions for note in motion.notes)
     return "; ".join([f"{motions[0].name}{count}: {', '.join(values)}", *notes])
 
@@ -124,7 +124,7 @@ def _span(values: Sequence[float], *, digits: int = 2) -> str:
 
 @dataclass(frozen=True)
 class QpCounts:
-    """Number of quadratic programs."""
+    """Numbers of quadratic programs in a run."""
 
     mean_per_frame: float
     worst_per_frame: int
@@ -133,7 +133,7 @@ class QpCounts:
 
     @classmethod
     def of(cls, reports: Sequence[StepReport], frames: np.ndarray) -> QpCounts:
-        """Count the programs of ``reports``; ``frames`` (n,) are indices into the trajectory's times."""
+        """Count the programs of ``reports``; ``frames`` (n,) are indices of the trajectory's states."""
         counts = np.array([0, *(report.qp_count for report in reports)])
         per_frame = np.diff(np.cumsum(counts)[frames]) if len(frames) > 1 else np.zeros(1)
         infeasible = int(sum(report.qp_infeasible for report in reports))
@@ -151,12 +151,12 @@ class StageTime:
 def stage_times(
     reports: Sequence[StepReport], frames: np.ndarray, drawing: Mapping[str, Sequence[float]]
 ) -> dict[str, StageTime]:
-    """Return the time of each stage; a frame without a stage counts as 0.
+    """Return the time of each stage; a stage takes no time in a frame in which it does not occur.
 
     Args:
         reports: Reports of all steps.
-        frames: (n,) indices into the trajectory's times.
-        drawing: ms of each rendered frame, by stage.
+        frames: (n,) indices of the trajectory's states.
+        drawing: Time of each rendered frame by stage, ms.
     """
     spans = list(zip(frames[:-1], frames[1:], strict=True))
     spent: dict[str, np.ndarray] = {}
@@ -179,7 +179,7 @@ class CageFacts:
     tets: int
     min_dihedral_degrees: float
     mass: float
-    """kg."""
+    """Mass of the body, kg."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ class GaussianCounts:
         return cls(read, read if drawn is None else drawn, geometry.excluded_count, geometry.excluded_opacity)
 
     def to_json(self) -> dict[str, JsonValue]:
-        """Return ``gaussians`` of the report."""
+        """Return the entry ``gaussians`` of the report."""
         return {
             "in": self.read,
             "split": self.drawn - self.read,
@@ -225,14 +225,14 @@ class Take:
     """One simulation of a run."""
 
     change: str | None
-    """Gentler form of a motion, for messages; None in the first take."""
+    """Description of the gentler form of a motion, for messages; None in the first take."""
     state: State
     """State of the first motion that failed; the worst state of all motions if none did."""
     note: str
-    """Why it failed; empty if it did not."""
+    """Reason for a failure; empty if no motion failed."""
 
     def to_json(self) -> dict[str, JsonValue]:
-        """Return an element of ``takes``."""
+        """Return an element of the report's list ``takes``."""
         return {"change": self.change, "state": self.state.value, "note": self.note}
 
 
@@ -298,7 +298,7 @@ class Report:
         write_report(path, self.to_json())
 
     def summary(self) -> str:
-        """Return two lines for the terminal: the result against the request, and the verdict of the audit."""
+        """Return two lines for the terminal: reached and requested values, and the verdict of the audit."""
         groups = [list(group) for _, group in groupby(self.motion, key=lambda motion: motion.name)]
         result = ", then ".join(map(_result, groups)) or "no motion began"
         state = "" if self.state is State.DONE else f"{self.state.value}: "
@@ -330,7 +330,7 @@ def verdict(result: Audit) -> str:
     exceeded = []
     for name, value in asdict(result).items():
         limit = AUDIT_LIMITS[name]
-        # Not "value > limit": NaN must fail, too.
+        # Not "value > limit", because NaN must exceed the limit, too.
         if not value <= limit:
             exceeded.append(f"{name} {value / limit:,.1f} times its limit" if limit else f"{name} {value}, not 0")
     return f"audit: FAILED: {', '.join(exceeded)}" if exceeded else "audit: passed"
@@ -360,11 +360,11 @@ def report_of_run(
         creature: The creature.
         trajectory: All states of the run.
         steps: Reports of all steps.
-        frames: (n,) indices into the trajectory's times.
+        frames: (n,) indices of the trajectory's states.
         done: The motions that were started.
         energy: Energy balance of ``trajectory``.
         gaussians: Numbers of Gaussians.
-        drawing: ms of each rendered frame, by stage.
+        drawing: Time of each rendered frame by stage, ms.
         source: Name of the capture.
         notes: Notes for the user.
         seed: Seed of the run.

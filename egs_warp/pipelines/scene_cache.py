@@ -1,6 +1,6 @@
-"""Cache of prepared scenes by their content: the same object in the same scene is prepared once.
+"""Cache of prepared scenes, so that the same object in the same scene is prepared only once.
 
-A file of the cache is a pickle that only this program of this user writes, in a folder of that user.
+The files are pickles in a folder of the user, into which only this program writes.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from egs_warp.segmentation.object_spec import ObjectSpec
 CACHE = "EGS_WARP_CACHE"
 """Environment variable with the folder of the cache; if it is empty, nothing is cached."""
 MAX_SCENES = 4
-"""Scenes in the cache; a new one replaces the one that was not used for the longest time."""
+"""Maximum number of scenes in the cache; a new one replaces the least recently used one."""
 _PACKAGES = (*MECHANICS, "torch", "opencv-python-headless", "scikit-image", "onnxruntime")
 """Packages on which a prepared scene depends."""
 
 
 def cache_folder() -> Path | None:
-    """Return the folder of the cache, which may not exist yet; None if nothing is to be cached."""
+    """Return the folder of the cache, which may not exist yet; None if caching is disabled."""
     given = os.environ.get(CACHE)
     if given is not None:
         return Path(given) / "scenes" if given else None
@@ -55,7 +55,7 @@ def scene_key(
     plane: Plane | None,
     options: SceneOptions,
 ) -> str:
-    """Return the SHA-256 of all that ``prepare_scene`` depends on, with the contents of the files and of this package.
+    """Return the SHA-256 of everything on which ``prepare_scene`` depends, including files and this package's sources.
 
     The arguments are those of ``prepare_scene``; ``posed`` are its cameras and photos.
     """
@@ -78,14 +78,14 @@ def read_scene(key: str) -> PreparedScene | None:
         with open(path, "rb") as file:
             scene = pickle.load(file)
         os.utime(path)
-    # Damaged files raise nearly anything.
+    # A damaged pickle may raise any exception.
     except Exception:
         return None
     return scene if isinstance(scene, PreparedScene) else None
 
 
 def write_scene(key: str, scene: PreparedScene) -> str | None:
-    """Write a scene to the cache and remove the oldest ones; return a note for the user if that fails."""
+    """Write a scene to the cache and remove the least recently used ones; return a note for the user if that fails."""
     folder = cache_folder()
     if folder is None:
         return None
@@ -103,7 +103,7 @@ def write_scene(key: str, scene: PreparedScene) -> str | None:
 
 
 class _Hash:
-    """File object that hashes what is written."""
+    """File object that hashes the data written to it."""
 
     def __init__(self) -> None:
         self.sha256 = hashlib.sha256()

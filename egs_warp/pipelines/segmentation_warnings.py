@@ -14,10 +14,10 @@ from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_search import lies_along
 
 _MIN_EDGE_SHARE = 0.02
-"""Length of the object along a picture's edge above which there is a warning, as a fraction of the shorter side; a
-shorter part may be a floater."""
+"""Length along which the object touches a picture's edge above which there is a warning, as a fraction of the picture's
+shorter side. A shorter part may be a floater."""
 _ALL_ROUND = 3
-"""Number of a picture's four edges at which an object that touches them surrounds the viewer."""
+"""Number of a picture's four edges that an object must touch to be considered to surround the viewer."""
 _MAX_SHARE = 1.0 / 3.0
 """Fraction of the capture's Gaussians above which there is a warning."""
 _REMEDY = "click with a minus on what does not belong to it, or mark it with masks"
@@ -26,7 +26,8 @@ _MAX_GAP = 0.03
 _FLOOR_DISTANCE = 0.03
 """Distance to the plane within which flat Gaussians belong to the floor, as a fraction of the object's size."""
 _MAX_FLOOR_SHARE = 0.05
-"""Fraction of the floor around the object above which there is a warning; a smaller one is the object's underside."""
+"""Fraction of the floor around the object that the object includes, above which there is a warning. A smaller part is
+the object's underside."""
 
 
 def segmentation_warnings(
@@ -67,7 +68,8 @@ def segmentation_warnings(
 
 
 def views_at_edges(object_cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[int, int]:
-    """Return the number of ``cameras`` in whose pictures the object touches the edges all round, and any edge."""
+    """Return the number of ``cameras`` in whose pictures the object touches nearly all edges (``_ALL_ROUND``), and the
+    number in whose pictures it touches any edge."""
     touched = [_touched_edges(object_cloud, camera) for camera in cameras]
     return sum(edges >= _ALL_ROUND for edges in touched), sum(edges > 0 for edges in touched)
 
@@ -77,7 +79,7 @@ def _touched_edges(object_cloud: GaussianCloud, camera: Camera) -> int:
     is_opaque = render_gaussians(object_cloud, camera).alpha.numpy() > 0.5
     edges = np.array([edge.sum() for edge in (is_opaque[0], is_opaque[-1], is_opaque[:, 0], is_opaque[:, -1])])
     least = _MIN_EDGE_SHARE * min(camera.width, camera.height)
-    # A short part at each of several edges counts as one edge.
+    # Parts that are too short individually are together considered one edge.
     return int((edges > least).sum()) or int(edges.sum() > least)
 
 

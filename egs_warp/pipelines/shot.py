@@ -23,16 +23,17 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.report import JsonValue
 
 MIN_SIDE, MAX_SIDE = 16, 4096
-"""Limits of the side of a film, pixels."""
+"""Minimum and maximum width and height of a film, pixels."""
 MAX_FPS = 1000.0
 """Maximum frame rate, Hz."""
 _SMOOTHING_TIME = 0.5
 """Standard deviation of the window that smooths the path of a following camera, s."""
 _SIDES, _TOP, _BOTTOM = 0.86, 0.86, 0.76
-"""Fraction of the picture from its centre to each edge that the creature fills at most; its shadow is below it."""
+"""Maximum extent of the creature from the centre of the picture towards the left and right, top, and bottom edges, as a
+fraction of the distance to the edge. The margin at the bottom leaves space for the shadow."""
 _FOLLOWED_SIZE = 1.15
-"""Ratio of the creature's smallest sizes in the pictures of a following and a fixed camera above which ``auto``
-follows."""
+"""Ratio above which ``auto`` follows the creature: its minimum size in the pictures of a following camera over its
+minimum size in the pictures of a fixed camera."""
 _ORBIT_MARGIN = 0.06
 """Margin of an orbiting camera, as a fraction of the shorter side of a picture."""
 _TURNTABLE_TIME = 4.0
@@ -40,10 +41,10 @@ _TURNTABLE_TIME = 4.0
 
 
 class CameraMove(StrEnum):
-    """Built-in camera motion."""
+    """Built-in camera motions."""
 
     AUTO = "auto"
-    """``follow`` if that shows the creature notably larger and there is no scene, otherwise ``fixed``."""
+    """``follow`` if the creature then appears notably larger and there is no scene, otherwise ``fixed``."""
     FIXED = "fixed"
     FOLLOW = "follow"
     ORBIT = "orbit"
@@ -54,16 +55,16 @@ class Shot:
     """Options of a film."""
 
     camera: str = CameraMove.AUTO
-    """``auto``, ``fixed``, ``follow`` (along the ground), ``orbit`` (once around during the film), or the name of a
-    JSON file with key cameras."""
+    """``auto``, ``fixed``, ``follow`` (along the ground), ``orbit`` (one circle during the film), or the name of a JSON
+    file with key cameras."""
     size: tuple[int, int] | None = None
-    """Width and height, pixels; None is the default of the film."""
+    """Width and height, pixels; None uses the default of the film."""
     fps: float = FRAME_RATE
-    """Frames per second of motion; each shows the nearest solver step."""
+    """Frames per second of simulated time; each frame shows the nearest solver step."""
     colour: tuple[float, float, float] | None = None
     """Background colour, 0 to 1, with the shadow on it; None shows the scene, or a floor without a scene."""
     transparent: bool = False
-    """Transparent background with only the shadow."""
+    """True for a transparent background that contains only the shadow."""
 
     def __post_init__(self) -> None:
         if self.size is not None and not all(MIN_SIDE <= side <= MAX_SIDE for side in self.size):
@@ -77,7 +78,7 @@ class Shot:
             raise ArgumentError("camera", f"give {', '.join(CameraMove)} or a path.json", value=f"{self.camera}{near}")
 
     def to_json(self) -> dict[str, JsonValue]:
-        """Return the options for ``asked`` of the report."""
+        """Return the options for the entry ``asked`` of the report."""
         options = {"camera": self.camera, "picture": self.size, "fps": self.fps, "colour": self.colour}
         return options | {"transparent": self.transparent}
 
@@ -95,7 +96,7 @@ class Shot:
             camera: Fixed camera of the film.
             trajectory: Node positions.
             steps: Indices of the states.
-            in_scene: The creature has a scene around it, in which ``auto`` is fixed.
+            in_scene: True if the creature has a scene around it, for which ``auto`` selects ``fixed``.
 
         Raises:
             UserError: The file of key cameras is invalid.
@@ -119,7 +120,7 @@ class Shot:
 
 
 def nearest_steps(time: np.ndarray, fps: float) -> np.ndarray:
-    """Return the states (n,) nearest to each frame at ``fps`` Hz; ``time`` (F + 1,) s are the times of the states."""
+    """Return the indices (n,) of the states nearest to each frame at ``fps`` Hz; the states have times (F + 1,), s."""
     frames = np.arange(round(fps * (time[-1] - time[0])) + 1) / fps + time[0]
     return np.searchsorted(0.5 * (time[1:] + time[:-1]), frames)
 
@@ -148,7 +149,8 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 def around(camera: Camera, positions: np.ndarray, *, count: int | None = None) -> list[Camera]:
     """Return cameras on a circle around the vertical axis through the centre of ``positions`` (f, N, 3).
 
-    They are as near as possible while each shows all positions. There are ``count`` cameras, by default f.
+    Their distance is approximately the minimum at which every camera shows all positions. There are ``count`` cameras,
+    by default f.
     """
     points = positions.reshape(-1, 3)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -167,12 +169,12 @@ def around(camera: Camera, positions: np.ndarray, *, count: int | None = None) -
 
 
 def framed(camera: Camera, points: np.ndarray) -> Camera:
-    """Return ``camera`` moved, without a rotation, to where the ``points`` (n, 3) fill its picture."""
+    """Return ``camera``, translated so that the ``points`` (n, 3) fill its picture."""
     return fitted_camera(camera, points, sides=_SIDES, top=_TOP, bottom=_BOTTOM)
 
 
 def _following(camera: Camera, trajectory: Trajectory, steps: np.ndarray) -> list[Camera]:
-    """Return cameras that follow the centre of mass along the ground: a jump is seen against a ground at rest."""
+    """Return cameras that follow the centre of mass horizontally but not vertically, so that a jump looks high."""
     masses = trajectory.node_mass / trajectory.node_mass.sum()
     positions = trajectory.positions[steps]
     path = np.einsum("n,fni->fi", masses, positions) * [1.0, 1.0, 0.0]

@@ -1,4 +1,4 @@
-"""Simulation of a creature: motions by name become a trajectory."""
+"""Simulation of a creature that performs motions, and the resulting trajectory."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from egs_warp.pipelines.shot import framed
 from egs_warp.pipelines.time_estimate import RemainingFrames
 
 FILMED_FROM = (0.82, -0.57, 0.27)
-"""Direction from the body to the camera of a film: ahead, left and up. It is 35 degrees off the face, so that the face
-is seen in three quarters and a path ahead is not foreshortened to a point."""
+"""Direction from the body to the camera of a film: components ahead, left and up. At 35 degrees from the facing
+direction, it gives a three-quarter view of the face and does not foreshorten a path ahead to a point."""
 _MAX_AZIMUTH = np.radians(60.0)
-"""Largest angle about the vertical between the camera of a film and a face of which the estimate is not clear."""
+"""Maximum azimuth of a film's camera relative to the estimated front if that estimate is not clear, radians."""
 FIELD_OF_VIEW = 30.0
 """Vertical field of view of the camera of a film, degrees."""
 _MAX_GET_UP_TIME = 120.0
@@ -39,13 +39,14 @@ MIN_FRAMES = 2
 MAX_FRAMES = 216_000
 """Maximum number of frames that can be requested."""
 _VERTICAL_COSINE = 0.9999
-"""Cosine to the vertical above which a view is from straight above or below."""
+"""Cosine of the angle to the vertical above which a view is considered vertical."""
 _SCENE_ELEVATION = 0.5
-"""Vertical over horizontal component of the view direction in a scene, so that its floor is visible."""
+"""Ratio of the vertical to the horizontal component of the direction to the camera in a scene, so that its floor is
+visible."""
 _OCCLUSION_COSINE = 0.7
-"""Cosine of the angle to the view direction above which Gaussians may hide the body."""
+"""Cosine of the horizontal angle to the view direction above which Gaussians may hide the body."""
 _OCCLUSION_TOLERANCE = 0.2
-"""Difference of occlusion that is ignored, sr: a tenth of a view, as a few floaters cause."""
+"""Difference of occlusion that is ignored, sr. It is about a tenth of a view; a few floaters can cause it."""
 _OCCLUSION_DISTANCE = 2.5
 """Approximate distance of the camera, in sizes of the filmed volume; Gaussians farther away are behind the camera."""
 
@@ -64,7 +65,7 @@ class SimulatedRun:
     fallen: str | None = None
     """Description of the fall that ended the run; None if there was none."""
     pushes: tuple[Push, ...] = ()
-    """Pushes that were requested."""
+    """Requested pushes."""
     has_frame_count: bool = False
     """True if the number of frames was requested."""
 
@@ -82,7 +83,7 @@ class SimulatedRun:
         return EndCause(self.fallen, self.simulation.stopped, has_time_limit=not self.has_frame_count, base=base)
 
     def unfinished_note(self) -> list[str]:
-        """Return notes for the user about motions and pushes that the end of the run prevented."""
+        """Return notes for the user about motions and pushes that did not take place because the run ended earlier."""
         ended = self.fallen is not None or self.simulation.stopped
         unapplied = [push.unapplied_note(float(self.trajectory.time[-1])) for push in self.pushes]
         motion_note = self.sequence.unstarted_note() if ended else self.sequence.unfinished_note()
@@ -103,8 +104,8 @@ class SimulatedRun:
 
         Args:
             size: Width and height of the image, pixels.
-            view_from: (3,) direction to the camera, in the capture's frame; of several (n, 3), the one nearest to the
-                default is used.
+            view_from: Direction (3,) to the camera, in the capture's frame; of several directions (n, 3), the one
+                nearest to the default is used.
             scene: Gaussians around the creature, in the frame of the body; if they hide the body in the default view,
                 the camera moves around it to the nearest clear side.
         """
@@ -122,7 +123,7 @@ class SimulatedRun:
             directions /= np.linalg.norm(directions, axis=1, keepdims=True)
             direction = directions[int(np.argmax(directions[:, :2] @ FILMED_FROM[:2]))]
         direction /= np.linalg.norm(direction)
-        # In views from above or below, the front of the body is up in the picture.
+        # In views from straight above or below, the body faces the top of the picture.
         upwards = ground.axes[0] if abs(direction[2]) > _VERTICAL_COSINE else ground.axes[2]
         camera = Camera.look_at(
             ground.world(middle + distance * direction),
@@ -135,8 +136,10 @@ class SimulatedRun:
         return framed(camera, self.trajectory.positions.reshape(-1, 3))
 
     def _usual_view(self) -> np.ndarray:
-        """Return the direction (3,) to the camera if nothing hides the body, ground axes: ``FILMED_FROM``, or half-way
-        between both candidates if the estimate of the front is not clear."""
+        """Return the direction (3,) to the camera, ground axes, if nothing hides the body.
+
+        It is ``FILMED_FROM``, or half-way between the front and its alternative if the estimate is not clear.
+        """
         alternative = self.creature.front.alternative
         if alternative is None:
             return np.array(FILMED_FROM)
@@ -149,10 +152,10 @@ class SimulatedRun:
         return np.array([level * np.cos(azimuth), level * np.sin(azimuth), up])
 
     def _clear_side(self, scene: GaussianCloud, middle: np.ndarray, reach: float, usual: np.ndarray) -> np.ndarray:
-        """Return the direction (3,) from ``middle`` (3,) to the camera, ground axes.
+        """Return the direction (3,) from ``middle`` (3,) to a camera that sees the body, ground axes.
 
-        Of eight sides, it is the one nearest to the direction ``usual`` (3,) whose occlusion by Gaussians nearer than
-        ``reach`` (m) exceeds the minimum by at most ``_OCCLUSION_TOLERANCE``.
+        Eight directions are tested. The result is nearest to the direction ``usual`` (3,) among those whose occlusion
+        by Gaussians nearer than ``reach`` (m) exceeds the minimum by at most ``_OCCLUSION_TOLERANCE``.
         """
         height = self.creature.body.height
         local = self.place.ground.local(scene.means.numpy().astype(np.float64)) - middle
@@ -202,15 +205,15 @@ def simulate(
         motion: The motion or motions, as a script or as its text (``egs_warp.motions.script``).
         frames: Number of frames at 60 Hz, the first at rest; None runs until the body has come to rest or fallen, or
             the time limit is reached.
-        max_seconds: Time limit of the motion, s; None is the motion's own limit.
-        step: Maximum step size, s; None is the default.
-        style: Style of jumps; None is the default.
+        max_seconds: Time limit of the motion, s; None uses the motion's own limit.
+        step: Maximum step size, s; None uses the default.
+        style: Style of jumps; None uses the default.
         pushes: Pushes during the run.
         get_up: If the body falls, get up and continue.
-        ends_at_fall: If the body falls, end the run at the step at which that is detected.
-        activations: (steps, M) m, prescribed muscle activations of each solver step. The motion then only defines what
-            is measured, and the run ends with the last row.
-        parts: Returns the folder that receives the finished steps; None writes none.
+        ends_at_fall: If the body falls, end the run at the step at which the fall is detected.
+        activations: (steps, M) m, prescribed muscle activations of each solver step. The motion then only defines the
+            measured values, and the run ends with the last row.
+        parts: Function that returns the folder for the finished steps; None writes none.
         resume: Folder with the finished steps of an interrupted run to continue.
         progress: Called after each frame with the number of finished frames and the number expected in total.
 
@@ -226,7 +229,7 @@ def simulate(
     expected = motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
     watch = FallMonitor(sequence, place, gets_up=get_up)
-    # A step may be longer than 1/60 s; then it is one frame.
+    # If a step is longer than 1/60 s, a frame has one step.
     frame = max(1.0 / FRAME_RATE, step or 0.0)
     limit = round(min(motion.frames(creature.body.height) / FRAME_RATE, max_seconds or np.inf) / frame)
     max_frames = limit if frames is None else frames - 1
@@ -269,14 +272,14 @@ def simulate(
 def checked_activations(creature: Creature, activations: np.ndarray, step: float | None) -> np.ndarray:
     """Return ``activations`` as (steps, M) float64 m.
 
-    Raises ``ArgumentError`` for another shape, fewer steps than a frame has, or values outside the muscles' bounds.
+    Raises ``ArgumentError`` for a wrong shape, fewer steps than one frame, or values outside the muscles' bounds.
     """
     count, min_steps = creature.muscles.segment_count, solver_steps(creature.body, step)[1]
     values = np.array(activations, dtype=np.float64)
     if values.ndim != 2 or values.shape[1] != count or len(values) < min_steps:
         advice = f"give a row of {count} metres, one for each muscle, for each of at least {min_steps} solver steps"
         raise ArgumentError("activations", f"of shape {values.shape}; {advice}")
-    # Not "any above the bound": NaN must fail, too.
+    # Not "any above the bound", because NaN must be rejected, too.
     if not (np.abs(values) <= creature.muscles.bounds * (1.0 + 1e-9)).all():
         raise ArgumentError("activations", "outside a muscle's bounds; keep each within muscles.bounds")
     return values

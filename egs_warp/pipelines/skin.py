@@ -1,4 +1,4 @@
-"""Export of the motion of a cage as a skinned mesh in glTF, for engines that draw no splats."""
+"""Export of the motion of a cage as a skinned mesh in glTF, for engines that do not draw splats."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ from egs_warp.pipelines.finished_run import FinishedRun
 
 ENDING = ".glb"
 MESH_FORMATS = (".obj", ".ply", ".stl", ".off")
-"""Name endings of meshes that are read."""
+"""Name endings of supported mesh files."""
 _MAX_BYTES = 512 * 2**20
 
 
 def export_skin(run: FinishedRun, path: Path, *, every: int = 1, mesh: Path | None = None) -> None:
-    """Write a mesh that the cage of ``run`` moves to a binary glTF file: metres, y up (docs/guide/engines.md).
+    """Write a mesh and its deformation by the cage of ``run`` to a binary glTF file: metres, y up
+    (docs/guide/engines.md).
 
     Args:
         run: The run to export.
         path: Name that ends in .glb.
         every: Export each ``every``-th frame at 60 Hz.
-        mesh: Triangles to move, in the frame and units of the capture; None moves the surface of the cage. Vertices
-            outside the cage move with the nearest part of it.
+        mesh: File of triangles in the frame and units of the capture; None uses the surface of the cage. Vertices
+            outside the cage move with the nearest point of it.
 
     Raises:
         UserError: ``path`` has another ending, or ``mesh`` cannot be read.
@@ -45,7 +46,7 @@ def export_skin(run: FinishedRun, path: Path, *, every: int = 1, mesh: Path | No
 
 
 def skin_of(run: FinishedRun, frames: np.ndarray, *, mesh: Path | None = None) -> SkinnedMesh:
-    """Return the mesh with its joints in ``frames`` (K,); the arguments are those of ``export_skin``."""
+    """Return the mesh with its joints in ``frames`` (K,); for the other arguments see ``export_skin``."""
     t = run.trajectory
     if mesh is None:
         used, faces = np.unique(run.mesh.boundary_faces(), return_inverse=True)
@@ -67,7 +68,7 @@ def skin_of(run: FinishedRun, frames: np.ndarray, *, mesh: Path | None = None) -
     local = (nodes - origins[:, None]) @ matrices
     upright = Rotation.from_matrix(Y_UP.axes)
     rotations = (upright * turns * upright.inv()).as_quat()
-    # Neighbouring quaternions of opposite sign would be interpolated through zero by some programs.
+    # Some programs would interpolate consecutive quaternions of opposite sign through zero.
     signs = np.cumprod(np.sign(np.einsum("ki,ki->k", rotations[1:], rotations[:-1])))
     rotations[1:] *= np.where(signs == 0.0, 1.0, signs)[:, None]
     return SkinnedMesh(
@@ -86,7 +87,7 @@ def skin_of(run: FinishedRun, frames: np.ndarray, *, mesh: Path | None = None) -
 
 
 def read_triangles(path: Path, frame: BodyFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Read vertices (V, 3), m, in ``frame`` and triangles (F, 3) of a mesh. Raises ``UserError`` for any other file."""
+    """Read a mesh: vertices (V, 3) in ``frame``, m, and triangles (F, 3). Raises ``UserError`` for any other file."""
     import meshio
 
     if path.suffix.lower() not in MESH_FORMATS:
@@ -98,7 +99,7 @@ def read_triangles(path: Path, frame: BodyFrame) -> tuple[np.ndarray, np.ndarray
         pieces = [cells.data for cells in read.cells if cells.type == "triangle"]
         pieces += [cells.data[:, corners] for cells in read.cells if cells.type == "quad" for corners in _HALVES]
         faces = np.concatenate(pieces).astype(np.int64)
-    # meshio raises many kinds of errors, and ends the process on some.
+    # meshio raises many kinds of errors, and calls ``sys.exit`` for some.
     except (Exception, SystemExit) as error:
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise UserError(f"{path}: cannot be read as a mesh of triangles ({reason[0][:200]}); write it again") from error
@@ -114,8 +115,11 @@ _HALVES = ([0, 1, 2], [0, 2, 3])
 
 
 def _weights(cage: TetMesh, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return four nodes and weights of each vertex. glTF has no negative weights, with which a vertex outside the cage
-    would follow the gradient; it follows the nearest point of its tetrahedron."""
+    """Return four nodes and weights (V, 4) of each vertex.
+
+    glTF allows no negative weights, which vertices outside the cage would need for linear extrapolation. Negative
+    weights are therefore replaced by zero.
+    """
     embedding = embed_points(cage, vertices, device="cpu")
     weights = np.maximum(embedding.weights.numpy(), 0.0)
     # glTF requires joint 0 where the weight is 0.

@@ -16,7 +16,7 @@ from egs_warp.pipelines.report import Take, motion_reports
 from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
 
 MAX_TAKES = 3
-"""Largest number of takes of a run."""
+"""Maximum number of takes of a run."""
 
 
 def simulate_takes(
@@ -34,8 +34,8 @@ def simulate_takes(
     """Simulate a script with ``simulate``. If the body falls, simulate it again with a gentler form of the motion in
     which it fell, up to ``MAX_TAKES`` times in all.
 
-    The result is the first take in which the body does not fall. If it falls in all of them, it is the first take,
-    continued after its fall. A push may be meant to throw the body over, so a run with pushes has one take.
+    The result is the first take in which the body does not fall. If it falls in every take, the result is the first
+    take, continued after its fall. A run with pushes has one take, because a push may be intended to topple the body.
 
     Args:
         creature: The creature at rest.
@@ -43,13 +43,13 @@ def simulate_takes(
         retakes: False simulates one take only.
         pushes: Pushes during the run.
         get_up: If the body falls in all takes, get up and continue.
-        parts: Returns the folder that receives the finished steps; further takes are recorded in folders in it.
+        parts: Function that returns the folder for the finished steps; later takes are recorded in its subfolders.
         resume: Folder with the finished steps of an interrupted run to continue.
         show_note: Called with a line for the user before each retake.
         options: Other arguments of ``simulate``.
 
     Returns:
-        The run, and its takes in order; no takes if the first one is shown without a fall.
+        The run, and its takes in order; no takes if there was only one.
 
     Raises:
         UserError: As ``simulate``.
@@ -74,7 +74,7 @@ def simulate_takes(
         show_note(f"take {len(takes)}: {take.note}; take {len(takes) + 1}: {change}")
     assert first is not None
     if first.fallen is not None:
-        # Its steps up to the fall are replayed.
+        # Replay the recorded steps up to the fall.
         recording = _recording(parts, resume, "shown")
         if parts is not None and recording["resume"] is None:
             recording["resume"] = parts()
@@ -83,7 +83,7 @@ def simulate_takes(
 
 
 def _judged(run: SimulatedRun, change: str | None) -> tuple[Take, int | None]:
-    """Return a take and the index of the first motion that failed, None if the body did not fall."""
+    """Return a take and the index of the first motion in which the body fell, None if it did not fall."""
     reports = motion_reports(run.trajectory, run.sequence.done, run.ending)
     for index, report in enumerate(reports):
         if report.state is State.FALLEN:
@@ -92,7 +92,7 @@ def _judged(run: SimulatedRun, change: str | None) -> tuple[Take, int | None]:
 
 
 def _can_begin(script: Script, run: SimulatedRun) -> bool:
-    """Return True if no motion of ``script`` is refused, such as one with more steps than a walk may have."""
+    """Return True if the body can perform all motions of ``script``; a gentler walk may have too many steps."""
     try:
         script.check(run.place)
     except UserError:

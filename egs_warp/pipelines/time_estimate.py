@@ -17,8 +17,8 @@ class RemainingFrames:
         Args:
             sequence: The motions.
             expected: Expected time of each motion, s.
-            frame: Time of a frame, s.
-            max_frames: Number of frames after which the run is cut off.
+            frame: Duration of a frame, s.
+            max_frames: Maximum number of frames of the run.
         """
         self._sequence, self._expected, self._frame, self._max_frames = sequence, expected, frame, max_frames
         self._rested: int | None = None
@@ -28,7 +28,7 @@ class RemainingFrames:
 
         Args:
             done: Number of finished frames.
-            finished: True if the body has come to its final rest.
+            finished: True if the body is at rest after the last motion.
         """
         if finished:
             self._rested = done if self._rested is None else self._rested

@@ -23,9 +23,11 @@ from egs_warp.training.outlier_views import is_outlier
 from egs_warp.training.posed_photos import PhotoSources, backdrop_colour, laid_over, read_views
 
 _HOLD_OUT_EVERY = 8
-"""Every eighth photo is used for evaluation and not for training, as in published methods."""
+"""Interval of the held-out photos: every eighth photo is used for evaluation and not for training, as is common in
+the literature."""
 _SH_STAGES = 10
-"""The SH degree is increased after each tenth of the iterations, up to the requested one."""
+"""Number of parts of the training: the SH degree is increased after each tenth of the iterations, up to the requested
+one."""
 _FIRST_GAUSSIANS = 30_000
 """Initial number of Gaussians if there are no triangulated points and no maximum."""
 
@@ -37,24 +39,24 @@ class PhotoScore:
     name: str
     held_out: bool
     psnr: float
-    """Peak signal-to-noise ratio, dB, of the render in the photo's exposure and white balance: one affine map of
-    colours, fitted to the photo."""
+    """Peak signal-to-noise ratio, dB, of the render after an affine map of its colours, which is fitted to the exposure
+    and white balance of the photo."""
     ssim: float
     """Mean structural similarity of the same render, 11 x 11 Gaussian window."""
     plain_psnr: float
-    """Peak signal-to-noise ratio, dB, of the render without that map."""
+    """Peak signal-to-noise ratio, dB, of the render without the affine map."""
     plain_ssim: float
-    """Mean structural similarity of the render without that map."""
+    """Mean structural similarity of the render without the affine map."""
     is_outlier: bool = False
     """True if the photo does not fit the others: its pose is wrong, or something moved. The means exclude it."""
 
 
 @dataclass(frozen=True)
 class MeanScore:
-    """Mean image quality over several photos, each in its own exposure."""
+    """Mean image quality over several photos."""
 
     psnr: float
-    """dB."""
+    """Mean peak signal-to-noise ratio, dB."""
     ssim: float
 
 
@@ -69,9 +71,9 @@ class TrainResult:
     views: tuple[TrainingView, ...]
     """Photos as used for evaluation: undistorted, downscaled and composited over the background."""
     photos: tuple[TrainingView, ...]
-    """The same photos with their alpha, if they have it."""
+    """The same photos with their alpha, if they have any."""
     cut_out: bool
-    """True if all photos have alpha; then they were trained over random colours."""
+    """True if all photos have alpha, so that the training used random background colours."""
     scores: tuple[PhotoScore, ...]
     """Score of each of ``views``."""
     background: tuple[float, float, float]
@@ -114,19 +116,19 @@ def train(
     Args:
         posed: COLMAP model, ``transforms.json``, ``cameras.json``, or another file of ``read_posed_images``.
         iterations: Number of optimiser steps.
-        max_gaussians: Maximum number of Gaussians; None adds Gaussians as long as the photos improve.
+        max_gaussians: Maximum number of Gaussians; None adds Gaussians as long as the renders improve.
         sh_degree: SH degree of the capture, 0 to 3.
-        background: Background colour, 0 to 1; None is white for photos with alpha, otherwise the mean colour at the
+        background: Background colour, 0 to 1; None uses white for photos with alpha, otherwise the mean colour at the
             borders of the photos, so that no Gaussians are used for a plain background.
-        max_side: Larger photos are downscaled to this side, pixels; None keeps their size.
-        inverted_masks: True if the object is black in masks; None decides from the masks, False if they are not
-            clear.
+        max_side: Maximum longer side of a photo, pixels; larger photos are downscaled. None keeps their size.
+        inverted_masks: True if the object is black in the masks, False if it is white; None determines it from the
+            masks, with False as the fallback.
         seed: Seed of the training.
-        device: Warp device; None is the current one.
-        threads: Number of threads; None is the default.
+        device: Warp device; None uses the current one.
+        threads: Number of threads; None uses the default.
         checkpoint: File (.npz) to which the state is written every half minute; it is not removed.
         resume: Continue from ``checkpoint``; on a CPU, equal arguments give equal bits.
-        progress: Called with number and loss of each step.
+        progress: Called after each step with its number and loss.
         stage: Called with a description of each stage as it starts.
 
     Raises:
@@ -215,7 +217,7 @@ def score_photo(
         view: The photo.
         background: Background colour, 0 to 1.
         held_out: True if the photo was not used for training.
-        threads: Number of threads; None is the default.
+        threads: Number of threads; None uses the default.
     """
     picture = render_gaussians(cloud, view.camera, background=background, threads=threads).colour.numpy()
     known = None if view.weight is None else view.weight > 0
@@ -231,7 +233,7 @@ def score_photo(
 
 
 def _held_out_outliers(scores: list[PhotoScore]) -> set[int]:
-    """Return the numbers of the held-out photos that are outliers: their errors are far above those of the others."""
+    """Return the indices of the held-out photos with errors far above the errors of the others."""
     judged = [number for number, score in enumerate(scores) if score.held_out]
     errors = np.array([10.0 ** (-scores[number].psnr / 20.0) for number in judged])
     return {judged[i] for i in np.flatnonzero(is_outlier(errors))}

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from egs_warp.training.posed_photos import PhotoSources
 
 _LAST_STEPS = 100
-"""Number of last steps whose mean loss is the final loss."""
+"""Number of steps at the end over which the final loss is averaged."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class TrainReport:
     """Score of each photo."""
     seconds: float
     frames_per_second: float
-    """Optimiser steps per second, not counting the first step."""
+    """Optimiser steps per second, without the first step."""
     device: str
     seed: int
     sh_degree: int

@@ -30,14 +30,14 @@ _WEIGHT_LENGTH = 0.5
 def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | None = None, quiet: bool = False) -> None:
     """Write ``run`` to a USD file in metres, with z up and 60 time codes per second.
 
-    Splats are a ParticleField3DGaussianSplat, which OpenUSD has had since 26.03; the cage is a mesh, muscles and
-    forces are curves, and the body is a tetrahedral mesh with its material (``usd_body``).
+    The splats are a ParticleField3DGaussianSplat (OpenUSD 26.03 and later), the cage is a mesh, muscles and forces are
+    curves, and the body is a tetrahedral mesh with its material (``usd_body``).
 
     Args:
         run: The run to export.
         path: Name that ends in .usdc or .usda.
         every: Export each ``every``-th frame at 60 Hz.
-        degree: SH degree of the colours, which are most of the file; None keeps that of the capture.
+        degree: SH degree of the colours, which take most of the file; None keeps the degree of the capture.
         quiet: Show no progress bar.
 
     Raises:
@@ -83,7 +83,7 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
             step, code = int(run.steps[index]), float(index)
             positions = t.positions[step]
             cloud = with_degree(deformer.deform(positions).cloud, degree)
-            # The default value, for programs and validators that do not specify a time.
+            # The first frame is also the default value, for programs and validators that do not specify a time.
             for at in (Usd.TimeCode.Default(), code) if index == 0 else (code,):
                 _write_sample(splats, cloud, at, Vt)
                 _set_points(cage, positions, at, Vt)
@@ -107,7 +107,7 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
 
 @contextmanager
 def _system_errors() -> Iterator[None]:
-    """Raise Python's error for a USD error that the operating system has caused, such as a full disk."""
+    """Raise ``OSError`` for a USD error that the operating system has caused, such as a full disk."""
     try:
         yield
     except RuntimeError as error:

@@ -1,6 +1,6 @@
-"""The soft body of a run in USD, for simulators of physics: a tetrahedral mesh with its material, and the ground.
+"""The soft body of a run in USD, for physics simulators: a tetrahedral mesh with its material, and the ground.
 
-Names of the deformable schemas follow the proposal of AOUSD, which OpenUSD does not contain yet.
+The names of the deformable schemas follow the AOUSD proposal, which OpenUSD does not contain yet.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ _GROUND_SIDE = 20.0
 def define_body(stage: Any, path: str, run: Trajectory) -> Any:
     """Define the soft body, its material, gravity and flat ground below ``path``; return the tetrahedral mesh.
 
-    Its default points are those of the first frame, at rest on the ground, so that a simulator starts there. Its rest
-    shape is free of stress.
+    The default points are the nodes in the first frame, at rest on the ground, from which a simulator starts. The rest
+    shape is the unloaded one, which is free of stress.
     """
     Gf, Sdf, UsdGeom, UsdPhysics, UsdShade, Vt = (
         import_module(f"pxr.{name}") for name in ("Gf", "Sdf", "UsdGeom", "UsdPhysics", "UsdShade", "Vt")
@@ -49,7 +49,7 @@ def define_body(stage: Any, path: str, run: Trajectory) -> Any:
     elastic = {"youngsModulus": run.young_modulus, "poissonsRatio": run.poisson_ratio}
     for name, value in elastic.items():
         material.GetPrim().CreateAttribute(f"physics:{name}", types.Float).Set(float(value))
-    # No schema has the coefficient of damping that is proportional to stiffness.
+    # No schema has an attribute for stiffness-proportional damping.
     material.GetPrim().CreateAttribute("egs:dampingTime", types.Float, custom=True).Set(float(run.damping_time))
     _bind(UsdShade, prim, material)
     scene = UsdPhysics.Scene.Define(stage, f"{path}/physics")

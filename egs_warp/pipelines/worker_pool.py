@@ -1,4 +1,4 @@
-"""Pool of worker processes with retry: a task whose process is lost is run again, finished tasks are not."""
+"""Pool of worker processes with retry: a task whose process is lost is run again."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from egs_warp.errors import UserError
 from egs_warp.launching import THREADS
 
 MAX_ATTEMPTS = 3
-"""Number of lost processes after which a task has failed."""
+"""Maximum number of attempts: a task fails when it has lost its process this many times."""
 ONE_THREAD: dict[str, str] = dict.fromkeys(
     ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS", THREADS], "1"
 )
 """Environment of a worker, which uses one core."""
 ProgressCallback = Callable[..., object]
-"""Function with which a task reports its progress."""
+"""Function that a task calls to report its progress."""
 TaskFunction = Callable[[Any, ProgressCallback], Any]
 """Function that runs a task; like tasks and results, it is picklable. It is sent to each worker once."""
 _WINDOWS, _NEW_GROUP = sys.platform == "win32", 0x200
@@ -61,7 +61,7 @@ class Event:
 
 
 class WorkerPool(Protocol):
-    """Workers by number; each has one task at a time."""
+    """Pool of numbered workers; each worker runs one task at a time."""
 
     size: int
     """Number of workers."""
@@ -132,11 +132,11 @@ def run_task(work: TaskFunction, task: Any, progress: ProgressCallback) -> tuple
 
 @dataclass(frozen=True)
 class _Running:
-    """Process of a worker."""
+    """Process of a worker, and the queue of its tasks."""
 
     process: subprocess.Popen[bytes]
     messages: queue.SimpleQueue[bytes | None]
-    """Messages to be sent to it; None ends the queue."""
+    """Pickled tasks to be sent to the process; None ends the queue."""
 
 
 class ProcessPool:
@@ -149,19 +149,19 @@ class ProcessPool:
         self.size = size
         self._work = pickle.dumps(work)
         main = sys.modules["__main__"]
-        # A function that a script defines exists in another process only after the script has run there as a module.
+        # A worker can unpickle a function of the main script only after it has run that script as a module.
         self._script = getattr(main, "__file__", None) if b"__main__" in self._work else None
         self._running: dict[int, _Running] = {}
         self._events: queue.SimpleQueue[tuple[int, Event]] = queue.SimpleQueue()
 
     def begin(self, worker: int, task: Any) -> None:
-        """Give an idle worker a task; a worker that does not exist, or was lost, is started."""
+        """Assign a task to an idle worker; a worker that does not exist, or was lost, is started."""
         if worker not in self._running:
             self._start(worker)
         self._running[worker].messages.put(pickle.dumps(task))
 
     def wait(self) -> Sequence[Event]:
-        """Block until a worker has sent a message; return it."""
+        """Block until a worker has sent a message; return the message."""
         while True:
             pid, event = self._events.get()
             running = self._running.get(event.worker)
@@ -224,7 +224,7 @@ class ProcessPool:
 def serve() -> None:
     """Run a worker of ``ProcessPool``: it receives messages on stdin and sends them on the original stdout."""
     out = os.fdopen(os.dup(1), "wb")
-    # Other output goes to stderr, line-buffered, because a worker ends without a flush.
+    # Redirect other output to stderr, line-buffered because a worker is terminated without a flush.
     os.dup2(2, 1)
     sys.stdout = os.fdopen(1, "w", buffering=1, closefd=False)
     script = pickle.load(sys.stdin.buffer)
@@ -244,7 +244,7 @@ def serve() -> None:
 
 
 def _receive_tasks(stream: IO[bytes], tasks: queue.SimpleQueue[Any]) -> None:
-    """Put received tasks into the queue; end this process as soon as the sender has ended."""
+    """Put received tasks into the queue; exit from this process when the sender has exited."""
     with contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
         while True:
             tasks.put(pickle.load(stream))
