@@ -38,8 +38,7 @@ class Bundle:
     def frame(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return means (n, 3), covariances (n, 3, 3) and rotations R (n, 3, 3) of the splats in frame ``index``.
 
-        The colour in direction d is the value of ``bands`` in direction d @ R. A tetrahedron maps a row vector v to v @
-        map.
+        The colour in direction d is ``bands`` in direction d @ R. A tetrahedron maps a row vector v to v @ map.
         """
         a, tet, rows = self.arrays, self.arrays["tets"], np.flatnonzero(self.arrays["carriers"] == 1)
         moved = self.nodes[index][a["cage_tets"]]
