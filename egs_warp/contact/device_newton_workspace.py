@@ -313,7 +313,7 @@ class NewtonWorkspace:
         return [as_warp(self._progress[None], real), as_warp(self._loop_condition, wp.int32)]
 
     def _enqueue_next_step(self, dt: float, ratio: float) -> None:
-        """Take a Newton step from the last trial and update the loop condition."""
+        """Enqueue a Newton step from the last trial and an update of the loop condition."""
         self.target_forces.copy_(self.trial_parts()[3])
         self._previous_contact_velocities.copy_(self.free_contact_velocities)
         self.enqueue_newton(dt, ratio)

@@ -21,7 +21,7 @@ _PIECES = (5, 10)
 _RING = 6
 """Width in pixels of the ring around the hole that is compared."""
 _MIN_PIXELS = 15
-"""Minimum number of pixels in such a part."""
+"""Minimum number of pixels in a part of the rim."""
 _OFFSETS_PER_PIXEL = 3
 """Number of best offsets at each pixel; an offset that is never among them is discarded."""
 _RIM = 3

@@ -168,7 +168,7 @@ def rectify(cloud: GaussianCloud, window: PlaneWindow, *, thickness: float) -> R
 
     Height and opacity come from a view straight down. The colour is the mean of side views, each projected onto the
     surface at that height, plus the detail of the side view with median contrast. The view straight down is not used
-    for colour: no photo was taken from there, and a capture shows disordered threads and gaps.
+    for colour: no photo was taken from above, and a capture shows disordered threads and gaps.
     """
     shape = (window.rows, window.columns)
     chosen = near_plane(cloud, window.plane, thickness)
@@ -230,7 +230,7 @@ def _side_view(
     floor: GaussianCloud, window: PlaneWindow, places: np.ndarray, azimuth: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return colour times opacity (rows, columns, 3) and opacity (rows, columns) of the ``floor`` at ``places`` (rows *
-    columns, 3), seen from ``azimuth``."""
+    columns, 3), seen from ``azimuth``, rad."""
     camera = window.camera_from(azimuth)
     image = render_gaussians(floor, camera, background=(0.0, 0.0, 0.0))
     x, y, z = camera.rotation @ places.T + camera.translation[:, None]

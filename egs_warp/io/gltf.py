@@ -240,8 +240,8 @@ class _Asset:
     def _packed(self, primitive: dict[str, Any], packed: dict[str, Any]) -> _Splats:
         """Decode a .spz.
 
-        Its axes are those of the mesh or, as the draft demands and few tools implement, rotated about y. The bounds of
-        ``POSITION`` decide between both.
+        Its axes are the axes of the mesh or, as the draft demands and few tools implement, these axes rotated about y.
+        The bounds of ``POSITION`` decide between the two.
         """
         view = self.tree["bufferViews"][packed["bufferView"]]
         start, size = view.get("byteOffset", 0), view["byteLength"]

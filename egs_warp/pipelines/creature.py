@@ -467,9 +467,10 @@ def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleS
 
 
 def _with_overlap(body: SoftBody, limbs: Limbs, overlap: float) -> SoftBody:
-    """Return ``body`` with soft parts that stick out (``CreatureOptions.overlap``).
+    """Return ``body`` with its protruding parts softened (``CreatureOptions.overlap``).
 
-    A body whose unloaded shape is the captured one (``_rest_state``) is not changed, because soft parts would droop.
+    A body whose unloaded shape is the captured one (``_rest_state``) is returned unchanged: its softened parts would
+    droop.
     """
     if overlap == 0.0 or _keeps_shape(body, limbs):
         return body

@@ -34,7 +34,8 @@ _ALIKE = 8
 _BY_COLOUR = 0.5
 """Maximum contribution of colours to the score, relative to the contribution of distances."""
 _ISLAND = 0.1
-"""Fraction of the retained part. A connected part that is smaller and has no click is dropped."""
+"""Minimum size of a connected part, as a fraction of the largest one. A part that is not larger and has no click is
+dropped."""
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ def connected_parts(
     """
     points = cloud.means.numpy()[chosen].astype(np.float64)
     if len(points) > _FOURTH:
-        # The distance of the nearest neighbour is often zero, because training that splits Gaussians in place leaves
+        # The distance to the nearest neighbour is often zero, because training that splits Gaussians in place leaves
         # many of them at the same point.
         few = points[:: -(-len(points) // _MAX_GAUSSIANS)]
         cell = max(cell, 2.0 * float(np.median(KDTree(points).query(few, k=_FOURTH + 1)[0][:, _FOURTH])))

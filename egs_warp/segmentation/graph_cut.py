@@ -149,7 +149,7 @@ class SplatGraph:
 def _differences(
     points: np.ndarray, colours: np.ndarray, first: np.ndarray, second: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each link, the distance of its ends divided by the median, and the difference of their colours
+    """Return, for each link, the distance between its ends divided by the median, and the difference of their colours
     divided by the mean."""
     away = np.linalg.norm(points[first] - points[second], axis=1)
     apart = np.linalg.norm(colours[first] - colours[second], axis=1)

@@ -70,7 +70,8 @@ class MeasuredGround:
     """Median, over the nodes next to the object, of the standard deviation between views, scene units."""
 
     def is_flat(self, height: float) -> bool:
-        """True if an object of ``height`` (scene units) may be placed on the plane instead."""
+        """True if the ground is so flat that an object of ``height`` (scene units) may be placed on the plane instead
+        of the height field."""
         return self.roughness < max(ROUGH * height, _MIN_SIGNAL_TO_NOISE * self.noise)
 
     def touched_by(self, object_cloud: GaussianCloud, size: float) -> HeightField:

@@ -66,7 +66,8 @@ def fit_plane(views: Sequence[PlaneView], *, start: Plane | None = None, seed: i
 
     The residual of a pixel is its relative error in depth, D_g / D_p - 1, which for one view is linear in m = -N / (N.o
     + d). Up to 40 % of the pixels may be outliers. The initial plane is found by random sampling or, if ``start`` is
-    given (in the paper, the view direction with d = 0), by reweighted least squares on inverse depth from there.
+    given (in the paper, the view direction with d = 0), by reweighted least squares on inverse depth, beginning
+    at ``start``.
 
     Raises ``UserError`` for masks of the wrong size or without depth, and if no plane explains the pixels.
     """

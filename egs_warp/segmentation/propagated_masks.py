@@ -133,7 +133,7 @@ def _propagate_mask(
 
 
 def _size(mask: np.ndarray, camera: Camera, middle: np.ndarray) -> float:
-    """Return the area of ``mask`` (H, W) at the distance of ``middle`` (3,), scene units squared."""
+    """Return the area of ``mask`` (H, W) at the distance of ``middle`` (3,) from the camera, scene units squared."""
     return float(mask.sum()) * (float(np.linalg.norm(camera.centre - middle)) / camera.fx) ** 2
 
 
