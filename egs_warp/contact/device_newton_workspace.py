@@ -440,7 +440,7 @@ class NewtonWorkspace:
 
     def _enqueue_newton(self, state: torch.Tensor) -> None:
         """Compute the nodal velocities after a Newton step without contact forces from ``state``, and the contact
-        velocities there.
+        velocities after this step.
         """
         velocities, free_velocities, residual, _ = self.parts(state)
         self._enqueue_free_velocities(velocities, residual, free_velocities)

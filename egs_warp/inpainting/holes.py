@@ -25,14 +25,14 @@ from egs_warp.segmentation.votes import MaskedView, check_size
 _TEXELS = 256
 """Texels across the window on which a hole is drawn."""
 _CONTACT = 0.05
-"""Fraction of the object's height. The part of the object below this height hides the floor from every side."""
+"""Height below which a part of the object hides the floor from every side, as a fraction of the object's height."""
 _LOW = 0.08
-"""Fraction of the object's size. Under parts of the object that are lower than this, the floor is unseen, or seen only
-at grazing angles and smeared."""
+"""Height, as a fraction of the object's size, below which parts of the object hide the floor under them, or leave it
+visible only at grazing angles and smeared."""
 _LOW_TEXELS = 200
 """Texels across the window of the hole under an object."""
 _BRIDGED = 0.1
-"""Fraction of the footprint's span. Gaps up to twice as wide are bridged."""
+"""Half of the maximum width of gaps in the footprint that are bridged, as a fraction of the footprint's span."""
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,10 @@ _MARGIN = 0.01
 hole's edge. Gaps in the floor that touch the hole are always added. With 0.03 and more, a sheet under a plush toy lost
 part of its edge."""
 _THICKNESS = 0.15
-"""Fraction of the hole's side. Gaussians within this distance of the plane are floor."""
+"""Distance from the plane within which Gaussians are floor, as a fraction of the hole's side."""
 _HAZE = 0.25
-"""Fraction of the hole's side. Gaussians over the hole that are lower than this are floor, or haze at the object's
-foot."""
+"""Height below which Gaussians over the hole are floor, or haze at the object's foot, as a fraction of the hole's
+side."""
 _KNOWN = 0.6
 """Minimum opacity of the floor at which its colour is known."""
 _SOLID = 0.3
@@ -58,7 +58,7 @@ _CHANNEL = 9.0
 _MIN_RIM_FRACTION = 0.4
 """Minimum fraction of the hole's edge that must be floor."""
 _MAX_ISLAND_AREA = 0.15
-"""Fraction of the hole's area. A smaller island of floor inside the hole is discarded."""
+"""Area below which an island of floor inside the hole is discarded, as a fraction of the hole's area."""
 _COLOUR_WEIGHT = 4.0
 """Weight of the squared distance between a Gaussian's colour and the painted colour."""
 _PAINTING = 0.5

@@ -12,8 +12,8 @@ from egs_warp.geometry.laplace_fill import laplace_fill
 _SHADE = 0.1
 """Colours closer to each other than this belong to the same shade."""
 _LINE = 5
-"""Pixels. Structure narrower than half of this is not tested, because a line may cross a hole although little of the
-rim has its colour."""
+"""Aperture of the median filter, pixels. Structure narrower than half of this is not tested, because a line may cross a
+hole although little of the rim has its colour."""
 _COMMON = 0.55
 """Minimum likelihood of a colour that may form an island, relative to the most likely colour."""
 _PATTERN = 0.5

@@ -15,9 +15,9 @@ from egs_warp.geometry.bitmaps import connected_parts, distance_to
 from egs_warp.geometry.laplace_fill import laplace_fill
 
 _BLUR = 2.0
-"""Texels, standard deviation of the blur that removes the floor's texture."""
+"""Standard deviation in texels of the blur that removes the floor's texture."""
 _BROAD = 12.0
-"""Texels, standard deviation of the blur for the expected brightness of the floor; light changes slowly."""
+"""Standard deviation in texels of the blur for the expected brightness of the floor; light changes slowly."""
 _DARKER = 0.2
 """Difference of the natural logarithm of brightness. Weaker darkening is hardly visible."""
 _SHADE, _SHADE_BLUR = 0.1, 4.0
@@ -42,9 +42,9 @@ _ROUNDS = 4
 """Maximum number of rounds. The floor from which brightness is predicted may itself be stained, until an earlier round
 has added that stain to the hole."""
 _FEW = 20
-"""Texels. The search ends when a round adds fewer."""
+"""Minimum number of texels that a round must add for the search to continue."""
 _REACH = 60.0
-"""Texels, equal to half of the hole's side: maximum distance of a stain's texels from the hole."""
+"""Maximum distance of a stain's texels from the hole, in texels: half of the hole's side."""
 _MAX_AREA = 2.0
 """Maximum area of a stain, as a multiple of the hole's area; a larger region is another part of the floor."""
 

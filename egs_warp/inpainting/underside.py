@@ -16,7 +16,7 @@ from egs_warp.inpainting.new_floor import flat_gaussians
 from egs_warp.inpainting.rectified import PlaneWindow
 
 _LOW = 0.03
-"""Fraction of the object's size. Gaussians lower than this above the ground are the object's rim."""
+"""Height above the ground below which Gaussians are the object's rim, as a fraction of the object's size."""
 _TEXELS = 128
 """Texels across the rim."""
 _SPACING = 2
@@ -24,7 +24,7 @@ _SPACING = 2
 _MAX_GROWTH = 0.2
 """Maximum number of new Gaussians, as a fraction of the object's."""
 _BRIDGED = 8.0
-"""Texels. Gaps in the rim up to twice this width are bridged."""
+"""Half of the maximum width, in texels, of gaps in the rim that are bridged."""
 _REACH = 2.0
 """Radius, in standard deviations of a splat, of the region around its mean that it covers."""
 _FOOT = 0.05

@@ -33,7 +33,7 @@ from egs_warp.motions.support import nearest_in_half_planes
 from egs_warp.motions.walk_posture import LeggedPosture, select_posture
 
 STOP_RISE_FRACTION = 0.94
-"""Fraction of the requested height: a thrust ends when the centre of mass would reach it in free flight. One more time
+"""Fraction of the requested height that the centre of mass would reach in free flight when a thrust ends. One more time
 step would exceed the requested height."""
 AIM_RISE_FRACTION = 0.99
 """Target of a thrust, as a fraction of the requested height. It exceeds ``STOP_RISE_FRACTION``, so that the thrust also

@@ -40,9 +40,9 @@ class ExtentMeasure(enum.Enum):
     """Measure of a Gaussian's extent towards the plane."""
 
     AXIS_TIPS = "axis-tips"
-    """The farthest of its six axis tips, Eq. (20)."""
+    """The farthest of the six axis tips of the ellipsoid, Eq. (20)."""
     ELLIPSOID = "ellipsoid"
-    """The extent of its ellipsoid along the normal, gamma sqrt(N^T Sigma N), which is up to sqrt 3 times the extent of
+    """The extent of the ellipsoid along the normal, gamma sqrt(N^T Sigma N), which is up to sqrt 3 times the extent of
     the tips."""
 
 
@@ -72,7 +72,7 @@ class StraddlingOptions:
     """Maximum number of rounds, before training, in which each straddling Gaussian is split in three across the plane.
     Smaller Gaussians can lie closer to the plane without crossing it. The paper's method is 0."""
     fine_reach: float = 0.006
-    """Fraction of the object's height. Gaussians that extend no farther across the plane are not split further."""
+    """Extent across the plane, as a fraction of the object's height, up to which Gaussians are not split further."""
     max_growth: float = 0.25
     """Maximum number of Gaussians that these splits add, as a fraction of the object's. Gaussians that extend farthest
     across the plane are split first. Without this limit, each round doubles the number of straddling Gaussians."""

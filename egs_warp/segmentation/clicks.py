@@ -17,7 +17,7 @@ from egs_warp.segmentation.votes import MaskedView, blending_votes
 _RADIUS = 0.004
 """Radius of a click as a fraction of the picture's longer side."""
 _MIN_WEIGHT_FRACTION = 0.1
-"""Fraction of the largest blending weight under a click; Gaussians below it are not hit."""
+"""Minimum blending weight of a Gaussian that a click hits, as a fraction of the largest weight under the click."""
 _SURFACE_FRACTION = 0.25
 """The clicked surface lies at the depth where the blending weight under the click, summed from the front, reaches this
 fraction."""

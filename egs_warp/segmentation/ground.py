@@ -20,40 +20,42 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.seen_surface import SeenSurface
 
 ROUGH = 0.01
-"""Fraction of the object's height. Ground is uneven if the standard deviation from its plane exceeds this. Contact
-allows a penetration of half as much."""
+"""Standard deviation of the ground from its plane, as a fraction of the object's height, above which ground is uneven.
+Contact allows a penetration of half as much."""
 REACH = 2.5
 """Half the side of the measured square about the object's centre, as a fraction of the object's size."""
 _SPACING = 0.025
-"""Fraction of the object's size: distance between nodes."""
+"""Distance between nodes, as a fraction of the object's size."""
 _BAND = 0.25
-"""Fraction of the object's size. Points farther from the plane are not ground."""
+"""Maximum distance of points of the ground from the plane, as a fraction of the object's size."""
 _MIN_VIEWS = 3
 """Minimum number of views that must show a node."""
 _MAX_VIEW_DIFFERENCE = 0.02
-"""Fraction of the object's size. A node is unknown if the standard deviation of its height between views is larger."""
+"""Standard deviation of a node's height between views, as a fraction of the object's size, above which the node is
+unknown."""
 _MIN_SIGNAL_TO_NOISE = 3.0
 """Ground is uneven if it is rougher than this many times the difference between views, because reflections also cause
 bumps."""
 _SMOOTHING = 0.7
 """Standard deviation, in nodes, of the blur that removes the noise of single nodes."""
 _ROUGHNESS_RADIUS = 1.0
-"""Fraction of the object's size: radius about the object in which roughness is measured."""
+"""Radius about the object in which roughness is measured, as a fraction of the object's size."""
 _VIEWS = 16
 _SIDE = 400
 """Longer side of a view, pixels."""
 _ELEVATIONS = (40.0, 58.0, 75.0)
 """Elevations of the views in degrees, if the capture's cameras are unknown."""
 _DEPTH_TOLERANCE = 0.005
-"""Fraction of the depth. A pixel shows ground if its depths with and without the object differ by less than this."""
+"""Difference between the depths with and without the object, as a fraction of the depth, below which a pixel shows
+ground."""
 _MAX_SLOPE = 1.2
-"""Rise over run between nodes. Steeper ground is an edge, and the plane continues beyond it."""
+"""Maximum slope (rise over run) between nodes. Steeper ground is an edge, and the plane continues beyond it."""
 _MAX_GAP = 0.05
-"""Fraction of the object's size. An object farther above the ground does not stand on it."""
+"""Maximum gap between the ground and an object that stands on it, as a fraction of the object's size."""
 _SOLID = 0.3
 """Minimum opacity of Gaussians that can touch the ground."""
 _PATCH = 0.05
-"""Fraction of the largest connected patch of ground. Smaller patches are specks."""
+"""Minimum size of a connected patch of ground, as a fraction of the largest one. Smaller patches are specks."""
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ _MIN_PART = 8
 _MAX_EXTENT = 0.9
 """Maximum extent along the ground of the part that one click selects, as a fraction of the capture's diagonal."""
 _FOOT = 0.015
-"""Fraction of the object's size. Within this height above the ground, Gaussians link nothing."""
+"""Height above the ground, as a fraction of the object's size, below which Gaussians have no links."""
 _FIRST_FOOT = 0.1
 """Foot height before the object's size is known, as a fraction of the lowest click's height above the ground."""
 _LEVEL_FOOT = 3.0
@@ -53,7 +53,8 @@ _GROUND_WEIGHT = 0.5
 _MAX_REMOVED = 2.0 / 3.0
 """Maximum share of a proposal that one click beside the object removes if no click is on the object."""
 _UNDER = 0.1
-"""Fraction of the object's size. The outline of the object's parts below this height is the outline of its foot."""
+"""Height, as a fraction of the object's size, below which the outline of the object's parts is the outline of its
+foot."""
 
 
 @dataclass(frozen=True)

@@ -23,24 +23,25 @@ _NOTHING_ABOVE = (
     "object: no part of it lies above the plane; mark it with other masks, a box or a point, or give its plane"
 )
 _MAX_FLOATER_MASS = 0.01
-"""Fraction of the object's opacity mass. A smaller connected part is a floater."""
+"""Opacity mass below which a connected part is a floater, as a fraction of the mass of the object's main part."""
 _MIN_PART_MASS = 0.05
-"""Fraction of the mass of the largest connected part. Another part claimed by masks belongs to the object if it has
-more."""
+"""Minimum opacity mass claimed by masks in another part that belongs to the object, as a fraction of the mass claimed
+in the main part."""
 _HOLLOW = 0.35
-"""Fraction of the object's size: maximum distance of a point in the middle of a hollow body from its surface."""
+"""Maximum distance of a point in the middle of a hollow body from its surface, as a fraction of the object's size."""
 TOUCHING = 0.1
-"""Fraction of the object's size. An object higher above a plane does not stand on it."""
+"""Maximum height above a plane of an object that stands on it, as a fraction of the object's size."""
 FOOTPRINT_HEIGHT = 0.08
-"""Fraction of the object's size. The parts of the object below this height hide the floor."""
+"""Height below which the parts of the object hide the floor, as a fraction of the object's size."""
 _HALO = 0.1
-"""Fraction of the object's size. Floaters within this distance of the object are its halo."""
+"""Maximum distance from the object of floaters that form its halo, as a fraction of the object's size."""
 _HALVINGS = 6
 """Maximum number of halvings of the first guess of an object's size, about a point in a large room."""
 _MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.3, 4.0
-"""Fractions of a guessed size. An object much smaller or larger than the guess does not match it."""
+"""Minimum and maximum size of an object that matches a guessed size, as fractions of that size."""
 _HANGING = 0.5
-"""Fraction of the object's size. A part that is entirely higher above the plane does not stand on it."""
+"""Maximum height above the plane of the lowest point of an object whose hollow shell the floor closes, as a fraction of
+the object's size."""
 _MIN_HAZE_WIDTH, _MIN_HAZE_WIDTH_RATIO, _MAX_HAZE_OPACITY = 0.05, 4.0, 0.3
 """Minimum width of haze, as a fraction of the object's size and as a multiple of the median width of the object's
 Gaussians, and its maximum opacity. Gaussians wider and fainter than this would move with the object as a halo."""
@@ -49,7 +50,7 @@ _MAX_HAZE_GAP, _MAX_COLOUR_DIFFERENCE, _NEIGHBOURS = 0.05, 0.15, 16
 1; and number of nearest Gaussians of the object with which the colour is compared. Haze within both limits is the
 object's own."""
 _FOOT = 0.015
-"""Fraction of the object's size. Within this height above the plane, floor and object cannot be separated by
+"""Height above the plane, as a fraction of the object's size, below which floor and object cannot be separated by
 connectivity."""
 
 

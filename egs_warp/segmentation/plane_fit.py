@@ -21,7 +21,7 @@ _TUKEY = 2.0
 outliers, but an object is close to the plane at its foot: with 3.0, the planes of some of 100 scenes are tilted by a
 degree."""
 _MIN_NOISE = 1e-3
-"""Fraction of the depth. Points nearer to the plane than this are on it. If a few wide splats form a floor, a plane
+"""Minimum scale of the residuals in the weights, as a fraction of the depth. If a few wide splats form a floor, a plane
 through three of them has zero error in half of the pixels, and without this minimum all other pixels would have zero
 weight."""
 _MIN_SINE = 0.02

@@ -22,7 +22,7 @@ from egs_warp.segmentation.votes import MaskedView, votes_of_masks
 _SIDE = 800
 """Longer side of the segmented pictures, pixels."""
 _MIN_VISIBLE_FRACTION = 0.002
-"""Fraction of a picture. If less of the object is visible, the picture is not segmented."""
+"""Minimum visible part of the object, as a fraction of the picture, for a picture to be segmented."""
 _PROMPTS = 3
 """Number of points inside the propagated mask that prompt the network."""
 _MIN_COVERED_FRACTION, _MAX_AREA_RATIO = 0.5, 3.0
@@ -32,7 +32,7 @@ _MAX_SALIENT_FRACTION, _MIN_OVERLAP = 0.6, 0.5
 """Maximum fraction of a picture that a salient region may cover; and the minimum overlap (intersection over union) of a
 mask with the consensus of all."""
 _HIDDEN = 0.03
-"""Fraction of the depth. A click that is farther than this behind the visible surface is hidden in that view."""
+"""Distance behind the visible surface, as a fraction of the depth, beyond which a click is hidden in that view."""
 
 
 def masks_of_clicks(
