@@ -84,7 +84,7 @@ class Hole:
         return cls(PlaneWindow(plane, outline.centre, outline.texel, rows, columns), mask > 0)
 
     def drawn_on(self, window: PlaneWindow) -> np.ndarray:
-        """(rows, columns) bool, the hole resampled on another window of the same plane."""
+        """Return (rows, columns) bool, the hole resampled on another window of the same plane."""
         columns, rows = np.meshgrid(np.arange(window.columns) + 0.5, np.arange(window.rows) + 0.5)
         places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
         at = self.window.pixels(places) - 0.5
@@ -198,7 +198,8 @@ def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
 
 
 def _on_plane(plane: Plane, camera: Camera, mask: np.ndarray) -> np.ndarray:
-    """(n, 3) points where the rays through the pixels of ``mask`` meet the plane; rays that miss it are left out."""
+    """Return (n, 3) points where the rays through the pixels of ``mask`` meet the plane; rays that miss it are left
+    out."""
     rays = camera_rays(camera)[mask]
     slope = rays @ plane.normal
     height = float(plane.heights(camera.centre))

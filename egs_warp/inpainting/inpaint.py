@@ -217,7 +217,7 @@ def _window_around(background: GaussianCloud, hole: Hole, margin: float) -> tupl
 def _in_hole(
     background: GaussianCloud, window: PlaneWindow, mask: np.ndarray, side: float, *, depth: float = 1.0
 ) -> np.ndarray:
-    """(n,) bool, True for Gaussians in the hole of the ``mask``: floor, haze over it, and Gaussians under it.
+    """Return (n,) bool, True for Gaussians in the hole of the ``mask``: floor, haze over it, and Gaussians under it.
 
     Gaussians that hang higher are not included. Gaussians below the plane are included down to ``depth`` times the
     ``side`` of the hole (scene units), because they are visible beyond the edge of a thin floor.
@@ -264,8 +264,8 @@ def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) 
 
 
 def _void(missing: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool, the part of the ``missing`` floor that lies beyond the floor's edge. Parts connected to it
-    only by a narrow channel are gaps and are not included."""
+    """Return (rows, columns) bool, the part of the ``missing`` floor that lies beyond the floor's edge. Parts connected
+    to it only by a narrow channel are gaps and are not included."""
     wide, _ = connected_parts(depth_inside(np.pad(missing, 1, mode="edge")) > _CHANNEL)
     edges = np.concatenate([wide[0], wide[-1], wide[:, 0], wide[:, -1]])
     outside = np.isin(wide, np.unique(edges[edges > 0]))[1:-1, 1:-1]

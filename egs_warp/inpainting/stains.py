@@ -50,7 +50,7 @@ _MAX_AREA = 2.0
 
 
 def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool, the stained part of the floor.
+    """Return (rows, columns) bool, the stained part of the floor.
 
     A stain is connected to the hole and, in at least one channel, darker than predicted from the floor farther out. The
     prediction uses the half of the floor that is farther from the hole; this half is never stained. Regions that extend
@@ -77,7 +77,7 @@ def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.
 
 
 def _next_to(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool, the stained part of the nearer half of the floor."""
+    """Return (rows, columns) bool, the stained part of the nearer half of the floor."""
     floor = known & ~hole
     if not floor.any():
         return np.zeros_like(hole)
@@ -95,7 +95,7 @@ def _next_to(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndar
 
 
 def shaded(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool, the part of the ``known`` (rows, columns) floor whose mean brightness is lower than
+    """Return (rows, columns) bool, the part of the ``known`` (rows, columns) floor whose mean brightness is lower than
     predicted from the floor farther from the ``hole`` (rows, columns).
 
     It need not be a stain, but copies of it would bring shadows to lit places.
@@ -127,7 +127,8 @@ def _unexpected(
 
 
 def _common(colours: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """(n,) bool, True for ``colours`` (n, 3) that are common among the ``floor``'s (m, 3); all are logarithms."""
+    """Return (n,) bool, True for ``colours`` (n, 3) that are common among the ``floor``'s (m, 3); all are
+    logarithms."""
     few = floor[:: -(-len(floor) // _SAMPLE)]
     alike = KDTree(few).query_ball_point(colours, _ALIKE, p=np.inf, return_length=True)
     return np.asarray(alike) >= _COMMON * len(few)

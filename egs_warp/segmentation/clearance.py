@@ -353,7 +353,8 @@ def _cropped(views: Sequence[TrainingView], foot: GaussianCloud) -> list[Trainin
 
 
 def _in_pictures(cloud: GaussianCloud, cameras: Sequence[Camera]) -> np.ndarray:
-    """(n,) bool, True for Gaussians that reach the picture of one of the ``cameras``, even if others hide them."""
+    """Return (n,) bool, True for Gaussians that reach the picture of one of the ``cameras``, even if others hide
+    them."""
     reached, threads = np.zeros(cloud.count, bool), available_threads()
     for camera in cameras:
         projected = project(cloud, view_from_camera(camera), antialiased=cloud.antialiased, threads=threads)

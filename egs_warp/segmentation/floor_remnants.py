@@ -35,8 +35,8 @@ def floor_scatter_height(scene: SceneAbovePlane, chosen: np.ndarray, size: float
 
 
 def floor_remnants(scene: SceneAbovePlane, chosen: np.ndarray, size: float) -> np.ndarray:
-    """(n,) bool, True for floor remnants: wide Gaussians of the object at its foot that have the floor's colour. On
-    uneven ground, Gaussians that lie flat are included."""
+    """Return (n,) bool, True for floor remnants: wide Gaussians of the object at its foot that have the floor's colour.
+    On uneven ground, Gaussians that lie flat are included."""
     low = scene.heights < _MAX_REMNANT_HEIGHT * size
     length = np.exp(scene.cloud.log_scales.numpy().max(axis=1))
     # Compare with the other Gaussians at the foot: in a coarse capture, all Gaussians of a stand are wide, and the

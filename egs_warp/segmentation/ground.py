@@ -167,8 +167,8 @@ def measure_ground(
 
 
 def _seen_points(cloud: GaussianCloud, bare: GaussianCloud, camera: Camera, plane: Plane) -> np.ndarray:
-    """(n, 3) points of the ground that ``camera`` sees both in ``cloud`` and in ``bare``, the capture without the
-    object. Points that appear only in ``bare`` are seen through the hole that the object leaves, and lie below the
+    """Return (n, 3) points of the ground that ``camera`` sees both in ``cloud`` and in ``bare``, the capture without
+    the object. Points that appear only in ``bare`` are seen through the hole that the object leaves, and lie below the
     ground. The heights of the returned points over ``plane`` are computed from the splats (``SeenSurface``)."""
     whole, left = SeenSurface.of(cloud, camera), SeenSurface.of(bare, camera)
     same = np.abs(whole.depth - left.depth) < _DEPTH_TOLERANCE * left.depth
@@ -176,8 +176,8 @@ def _seen_points(cloud: GaussianCloud, bare: GaussianCloud, camera: Camera, plan
 
 
 def _without_edges(heights: np.ndarray, known: np.ndarray, spacing: float) -> np.ndarray:
-    """(rows, columns) bool, nodes whose neighbours are not much higher or lower. The rim of the ``known`` nodes is
-    excluded, as it is ragged."""
+    """Return (rows, columns) bool, the nodes whose neighbours are not much higher or lower. The rim of the ``known``
+    nodes is excluded, as it is ragged."""
     low = ndimage.minimum_filter(np.where(known, heights, np.inf), 3)
     high = ndimage.maximum_filter(np.where(known, heights, -np.inf), 3)
     rim = np.logical_not(ndimage.binary_erosion(ndimage.binary_closing(known, iterations=2), iterations=1))

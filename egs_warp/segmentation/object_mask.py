@@ -189,15 +189,15 @@ def _of_size(
 
 
 def _haze_indices(scene: SceneAbovePlane, object_indices: np.ndarray, size: float) -> np.ndarray:
-    """(k,) int, the haze among the Gaussians ``object_indices`` (m,)."""
+    """Return (k,) int, the indices of the haze among the Gaussians ``object_indices`` (m,)."""
     across = scene.cloud.breadths(object_indices)
     wide = across > max(_MIN_HAZE_WIDTH * size, _MIN_HAZE_WIDTH_RATIO * float(np.median(across)))
     return object_indices[wide & (scene.opacity[object_indices] < _MAX_HAZE_OPACITY)]
 
 
 def _is_own_haze(scene: SceneAbovePlane, haze: np.ndarray, object_mask: np.ndarray, size: float) -> np.ndarray:
-    """(k,) bool, True for the Gaussians ``haze`` (k,) that are inside the object ``object_mask`` (n,) bool, or near it
-    with similar colours.
+    """Return (k,) bool, True for the Gaussians ``haze`` (k,) that are inside the object ``object_mask`` (n,) bool, or
+    near it with similar colours.
 
     In the background, this haze would remain as a ghost of the object.
     """
@@ -298,7 +298,7 @@ def _diagonal(points: np.ndarray) -> float:
 
 
 def _within(points: np.ndarray, chosen: np.ndarray, margin: float) -> np.ndarray:
-    """(n,) bool, True for ``points`` (n, 3) in the box of nearly all ``chosen`` (n,) bool ones, enlarged by
+    """Return (n,) bool, True for ``points`` (n, 3) in the box of nearly all ``chosen`` (n,) bool ones, enlarged by
     ``margin``."""
     if not chosen.any():
         return chosen

@@ -54,7 +54,7 @@ class PlaneFit:
 
 
 def plane_depth(plane: Plane, camera: Camera) -> np.ndarray:
-    """(H, W) z-depth D_p of the plane along each pixel's ray, Eq. (18); 0 where the ray does not meet it."""
+    """Return (H, W), the z-depth D_p of the plane along each pixel's ray, Eq. (18); 0 where the ray misses it."""
     slope = camera_rays(camera) @ plane.normal
     height = float(plane.heights(camera.centre))
     depth = -height / np.where(slope == 0.0, np.inf, slope)
@@ -106,7 +106,8 @@ class _Pixels:
         return self.origins + self.depth[:, None] * self.rays
 
     def residuals(self, plane: Plane) -> np.ndarray:
-        """(p,) D_g / D_p - 1 = -(height of the rendered point) / (height of the camera), heights over ``plane``."""
+        """Return (p,), the relative errors D_g / D_p - 1 = -(height of the rendered point) / (height of the camera),
+        with heights over ``plane``."""
         camera = self.origins @ plane.normal + plane.offset
         least = 1e-9 * np.abs(self.depth)
         camera = np.where(np.abs(camera) < least, least, camera)

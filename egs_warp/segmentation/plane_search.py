@@ -224,12 +224,12 @@ def _masked(
 
 
 def near_plane(cloud: GaussianCloud, plane: Plane, thickness: float) -> np.ndarray:
-    """(n,) bool, True for Gaussians whose mean is within ``thickness`` (scene units) of the plane."""
+    """Return (n,) bool, True for Gaussians whose mean is within ``thickness`` (scene units) of the plane."""
     return np.abs(plane.heights(cloud.means.numpy())) < thickness
 
 
 def lies_along(cloud: GaussianCloud, plane: Plane | HeightField) -> np.ndarray:
-    """(n,) bool, True for flat Gaussians parallel to ``plane``, like those of a floor, at any height."""
+    """Return (n,) bool, True for flat Gaussians parallel to ``plane``, like those of a floor, at any height."""
     scales = cloud.log_scales.numpy()
     turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
     thin = np.take_along_axis(turns, scales.argmin(axis=1)[:, None, None], axis=2)[:, :, 0]
@@ -254,7 +254,7 @@ def further_planes(cloud: GaussianCloud, plane: Plane, size: float, count: int) 
 
 
 def _is_one_patch(level: GaussianCloud, plane: Plane, cell: float) -> bool:
-    """True if one patch of well covered cells (scene units) contains most of the surface near ``plane``."""
+    """Return True if one patch of well covered cells (scene units) contains most of the surface near ``plane``."""
     chosen = near_plane(level, plane, 0.5 * cell)
     if not chosen.any():
         return False

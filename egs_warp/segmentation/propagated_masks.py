@@ -162,8 +162,8 @@ def _well_apart(chosen_before: Sequence[Camera], cameras: Sequence[Camera], coun
 
 
 def _innermost(mask: np.ndarray, count: int) -> np.ndarray:
-    """(k, 2) pixels, at most ``count``: the innermost point of ``mask`` (H, W), then repeatedly the innermost of the
-    remaining points. Points within twice the depth of an earlier one are excluded."""
+    """Return (k, 2) pixels, at most ``count``: the innermost point of ``mask`` (H, W), then repeatedly the innermost of
+    the remaining points. Points within twice the depth of an earlier one are excluded."""
     places = []
     depth = depth_inside(np.pad(mask, 1))[1:-1, 1:-1]
     rows, columns = np.indices(mask.shape)

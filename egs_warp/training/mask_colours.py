@@ -73,7 +73,7 @@ class _MaskView:
 
     @classmethod
     def of(cls, one: PosedImage) -> _MaskView | None:
-        """Read the mask of ``one``; return None if it is unreadable or its orientation (portrait or landscape) is wrong."""
+        """Read the mask of ``one``; return None if it is unreadable or has the wrong orientation."""
         assert one.mask is not None
         try:
             limit = MAX_MASK_RATIO * one.camera.width * one.camera.height
