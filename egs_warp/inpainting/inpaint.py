@@ -40,7 +40,7 @@ _KNOWN = 0.6
 _SOLID = 0.3
 """Minimum opacity of a Gaussian that is floor."""
 _TEXELS_ACROSS = 120.0
-"""Texels along the side of the hole, whatever its size, so that the computing time does not depend on the size."""
+"""Number of texels along the side of a hole of any size, so that the computing time does not depend on the size."""
 _WINDOW = 3.0
 """Side of the window as a multiple of the hole's side. The window contains the hole and the floor to copy from."""
 _SHARPNESS = 0.5

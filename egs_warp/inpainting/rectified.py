@@ -190,9 +190,14 @@ def rectify(cloud: GaussianCloud, window: PlaneWindow, *, thickness: float) -> R
 def _from_all_around(
     floor: GaussianCloud, window: PlaneWindow, solid: np.ndarray, height: np.ndarray, otherwise: np.ndarray
 ) -> np.ndarray:
-    """Return (rows, columns, 3), the colour of the ``floor`` from side views. Args: floor: its Gaussians. window: the
-    window on the plane. solid: (rows, columns) bool, where the floor is opaque. height: (rows, columns) height of the
-    floor. otherwise: (rows, columns, 3) colour where no view shows the floor.
+    """Return (rows, columns, 3), the colour of the ``floor`` from side views.
+
+    Args:
+        floor: its Gaussians.
+        window: the window on the plane.
+        solid: (rows, columns) bool, where the floor is opaque.
+        height: (rows, columns) height of the floor.
+        otherwise: (rows, columns, 3) colour where no view shows the floor.
     """
     share = np.maximum(ndimage.gaussian_filter(solid.astype(float), _SMOOTHING), _MIN_ALPHA)
     level = ndimage.gaussian_filter(np.where(solid, height, 0.0), _SMOOTHING) / share

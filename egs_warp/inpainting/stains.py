@@ -19,7 +19,8 @@ _BLUR = 2.0
 _BROAD = 12.0
 """Standard deviation in texels of the blur for the expected brightness of the floor; light changes slowly."""
 _DARKER = 0.2
-"""Difference of the natural logarithm of brightness. Weaker darkening is hardly visible."""
+"""Minimum darkening of a stain, as a difference of the natural logarithm of brightness. Weaker darkening is hardly
+visible."""
 _SHADE, _SHADE_BLUR = 0.1, 4.0
 """Difference of the natural logarithm of brightness, and standard deviation of a blur in texels. Floor whose blurred
 brightness is lower than predicted by more than this difference is not copied."""

@@ -50,9 +50,9 @@ class SceneAbovePlane:
     heights: np.ndarray
     opacity: np.ndarray
     is_opaque: np.ndarray
-    """(n,) bool, opaque enough to connect."""
+    """(n,) bool, True for Gaussians that are opaque enough to connect parts."""
     is_level: np.ndarray
-    """(n,) bool, flat and parallel to the plane, as a floor's Gaussians are."""
+    """(n,) bool, True for Gaussians that are flat and parallel to the plane, as a floor's Gaussians are."""
 
     @classmethod
     def of(cls, cloud: GaussianCloud, plane: Plane | HeightField) -> SceneAbovePlane:

@@ -363,7 +363,7 @@ def _in_pictures(cloud: GaussianCloud, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def straddling_loss(tensors: GaussianTensors, near: Any, normal: Any, offset: float, reach: ExtentMeasure) -> Any:
-    """L_seg of Eq. (21): the sum of eta_seg - |d0| over the Gaussians with indices ``near`` (m,) that straddle the
+    """Return L_seg (Eq. 21), the sum of eta_seg - |d0| over the Gaussians with indices ``near`` (m,) that straddle the
     plane.
 
     The result is a scalar tensor, scene units; ``normal`` (3,) and ``offset`` are the plane's.

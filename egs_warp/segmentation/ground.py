@@ -63,7 +63,8 @@ class MeasuredGround:
     """Heights of the ground about an object, and their quality."""
 
     field: HeightField
-    """Scene units. Unseen ground, including the ground under the object, is the harmonic continuation."""
+    """Heights of the ground, scene units. Unseen ground, including the ground under the object, is the harmonic
+    continuation."""
     known: np.ndarray
     """(rows, columns) bool, nodes that were seen."""
     roughness: float

@@ -64,8 +64,8 @@ def segment(
 ) -> Segmentation:
     """Find the object that ``spec`` describes and that stands on ``plane`` or on uneven ground.
 
-    Around a point, the object's size is first guessed as half of the capture's. If nothing of that size stands on the
-    plane, which is common in a room, the guess is halved repeatedly.
+    Around a point, the object's size is first guessed as half of the capture's size. If nothing of that size stands on
+    the plane, which is common in a room, the guess is halved repeatedly.
 
     Args:
         cloud: the capture.
@@ -283,7 +283,8 @@ def _body(
 
 
 def _first_size(scene: SceneAbovePlane, claimed_by_user: np.ndarray, spec: ObjectSpec) -> float:
-    """Return the first guess of the object's size, scene units: half of the capture's if only a point is known."""
+    """Return the first guess of the object's size, scene units: half of the capture's size if only a
+    point is known."""
     if spec.box is not None:
         return float(np.linalg.norm(spec.box.high - spec.box.low))
     standing = claimed_by_user & scene.is_opaque & (scene.heights > 0.0)

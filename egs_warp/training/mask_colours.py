@@ -22,7 +22,7 @@ _MAX_MASKS = 24
 _SIDE = 64
 """Longer side to which masks are reduced, pixels."""
 _MIN_RIM = 0.85
-"""Minimum mean fraction of white pixels along the border at which the white region is taken for the surroundings."""
+"""Minimum mean fraction of white pixels along the border at which the white region is treated as the surroundings."""
 _AREA = (0.01, 0.6)
 """Range of the mean fraction of black pixels in masks that show the object in black."""
 _POINTS = 40_000

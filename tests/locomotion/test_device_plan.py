@@ -130,8 +130,8 @@ def test_device_plans_equal_host_plans(creature: Creature, stepper: LocomotionSt
 def test_the_solve_continues_from_the_end_of_the_plan(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The plan has already queued the first Newton step, so the solve makes no further request. The step equals one
-    that is requested explicitly."""
+    """The plan has already queued the first Newton step, so the solve makes no further request. The step equals an
+    explicitly requested step."""
     memory = stepper.initial_memory()
     start = begun(stepper, creature.start, memory)
     found = planner_of(stepper).plan(start, asks(creature, 0.1))
