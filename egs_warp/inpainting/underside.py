@@ -22,7 +22,7 @@ _TEXELS = 128
 _SPACING = 2
 """Minimum number of texels between new Gaussians."""
 _MAX_GROWTH = 0.2
-"""Maximum number of new Gaussians, as a fraction of the object's."""
+"""Maximum number of new Gaussians, as a fraction of the number in the object."""
 _BRIDGED = 8.0
 """Half of the maximum width, in texels, of gaps in the rim that are bridged."""
 _REACH = 2.0
@@ -35,7 +35,7 @@ def with_underside(object_cloud: GaussianCloud, ground: HeightField, size: float
     """Return the object with flat Gaussians over the opening that its rim at the ground encloses, and their number.
 
     Heights and colours solve Laplace's equation with the rim's values as boundary values. The number of new Gaussians
-    is at most a fifth of the object's.
+    is at most a fifth of the number in the object.
 
     Args:
         object_cloud: Gaussians of the object, scene units.

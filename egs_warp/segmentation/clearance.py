@@ -74,8 +74,9 @@ class StraddlingOptions:
     fine_reach: float = 0.006
     """Extent across the plane, as a fraction of the object's height, up to which Gaussians are not split further."""
     max_growth: float = 0.25
-    """Maximum number of Gaussians that these splits add, as a fraction of the object's. Gaussians that extend farthest
-    across the plane are split first. Without this limit, each round doubles the number of straddling Gaussians."""
+    """Maximum number of Gaussians that these splits add, as a fraction of the number in the object. Those that extend
+    farthest across the plane are split first. Without this limit, each round doubles the number of straddling
+    Gaussians."""
     cut_rest: bool = True
     """Cut Gaussians that still straddle after training at the plane, as ``SPLIT`` does; the paper does not cut them."""
     seed: int = 0

@@ -277,7 +277,8 @@ def _body(
         shell = np.concatenate([shell, shell - 2.0 * (heights[:, None] - foot) * scene.plane.normal])
     chosen |= enclosed(scene.means, shell, 2.0 * size / CELLS) & (scene.heights > foot)
     chosen |= lying & scene.is_under(chosen, 0.1 * size, size)
-    # Gaussians that were added by position are removed again if a removed Gaussian is nearer than one of the object's.
+    # Gaussians that were added by position are removed again if a removed Gaussian is nearer than any
+    # Gaussian of the object.
     removed |= nearer_to(scene.means, scene.means[removed], scene.means[chosen & ~removed])
     return chosen & ~removed, small_parts, removed
 

@@ -25,7 +25,7 @@ _OPAQUE = 0.98
 """Minimum opacity of the capture at pixels whose colours are matched."""
 _MATCHING_ROUNDS, _MATCHED_PIXELS = 20, 10_000
 """Number of rounds that select the best-matching pixels, and maximum number of pixels, in the fit of a photo's colours
-to the capture's."""
+to the colours of the capture."""
 _REGULARIZATION = 1e-5
 """Weight of the distance between the mixing matrix and the diagonal matrix of the channels' own gains."""
 
