@@ -77,7 +77,7 @@ class Stopwatch:
 
 
 def recorded(creature: Creature, steps: int) -> np.ndarray:
-    """(steps, M) m, activations of the first ``steps`` steps of a jump."""
+    """Return (steps, M) in m, the activations of the first ``steps`` steps of a jump."""
     frames = -(-steps // solver_steps(creature.body)[1])
     return simulate(creature, motion("jump"), frames=frames + 1).trajectory.activations[:steps]
 

@@ -125,7 +125,7 @@ def photograph(
 
 
 def face_rotations(mesh: PaintedMesh, vertices: np.ndarray) -> np.ndarray:
-    """(F, 3, 3) rotation of each face from rest to ``vertices`` (V, 3).
+    """Return (F, 3, 3), the rotation of each face from rest to ``vertices`` (V, 3).
 
     The rotation is the polar factor of the face's deformation gradient, which maps the unit normal at rest to the
     deformed one.
@@ -154,7 +154,7 @@ def carried_vertices(mesh: PaintedMesh, cage: TetMesh, nodes: np.ndarray, device
 
 
 def surface_points(mesh: PaintedMesh, count: int, seed: int) -> np.ndarray:
-    """(count, 3) points, uniformly distributed over the surface."""
+    """Return (count, 3) points, uniformly distributed over the surface."""
     rng = np.random.default_rng(seed)
     corners = mesh.vertices[mesh.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

@@ -52,19 +52,20 @@ def _mixed(matrix: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
 
 
 def _xyz(planes: torch.Tensor) -> torch.Tensor:
-    """(1, 3, H, W) XYZ of linear RGB ``planes``, relative to the white point."""
+    """Return (1, 3, H, W), the XYZ values of linear RGB ``planes``, relative to the white point."""
     matrix = torch.tensor(_XYZ_FROM_RGB, dtype=planes.dtype, device=planes.device)
     return _mixed(matrix / matrix.sum(dim=1, keepdim=True), planes)
 
 
 def _opponent(linear: torch.Tensor) -> torch.Tensor:
-    """(1, 3, H, W) Y, Cx, Cz: lightness, red-green, blue-yellow."""
+    """Return (1, 3, H, W), the channels Y, Cx, Cz: lightness, red-green, blue-yellow."""
     x, y, z = _xyz(linear).unbind(dim=1)
     return torch.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], dim=1)
 
 
 def _filtered_lab(opponent: torch.Tensor) -> torch.Tensor:
-    """(1, 3, H, W) L*, a*, b* after the contrast sensitivity filter; chroma is scaled by lightness (Hunt effect)."""
+    """Return (1, 3, H, W), the channels L*, a*, b* after the contrast sensitivity filter; chroma is scaled by
+    lightness (Hunt effect)."""
     widest = max(width for terms in _SENSITIVITIES for _, width in terms)
     radius = int(np.ceil(3.0 * np.sqrt(widest / (2.0 * np.pi**2)) * PIXELS_PER_DEGREE))
     degrees = torch.arange(-radius, radius + 1, dtype=opponent.dtype, device=opponent.device) / PIXELS_PER_DEGREE
@@ -96,7 +97,7 @@ def _hunted_lab(linear: torch.Tensor) -> torch.Tensor:
 
 
 def _colour_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """(1, 1, H, W) from 0 to 1: HyAB distance with large values compressed."""
+    """Return (1, 1, H, W), 0 to 1, the HyAB distance with large values compressed."""
 
     def distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         off = a - b
@@ -114,7 +115,8 @@ def _colour_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
 
 
 def _feature_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """(1, 1, H, W) from 0 to 1: edges or points that exist in only one of two lightness planes (1, 1, H, W)."""
+    """Return (1, 1, H, W), 0 to 1, the edges or points that exist in only one of two lightness planes (1, 1, H,
+    W)."""
     deviation = 0.5 * _FEATURE_DEGREES * PIXELS_PER_DEGREE
     radius = int(np.ceil(3.0 * deviation))
     x = torch.arange(-radius, radius + 1, dtype=one.dtype, device=one.device)
@@ -134,7 +136,7 @@ def _feature_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
 
 
 def _convolved(plane: torch.Tensor, along_x: torch.Tensor, along_y: torch.Tensor) -> torch.Tensor:
-    """(1, 1, H, W) plane correlated with two line kernels of equal length; border pixels are replicated."""
+    """Return (1, 1, H, W), the plane correlated with two line kernels of equal length; border pixels are replicated."""
     radius = len(along_x) // 2
     padded = torch.nn.functional.pad(plane, [radius] * 4, mode="replicate")
     rows = torch.nn.functional.conv2d(padded, along_x[None, None, None])

@@ -38,13 +38,13 @@ POP = 1.3
 
 
 def projected(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """(P, 2) projections of ``points`` (P, 3), pixels."""
+    """Return (P, 2), the projections of ``points`` (P, 3), pixels."""
     local = points @ camera.rotation.T + camera.translation
     return local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
 
 def flow_to(camera: Camera, now: GaussianCloud, after: GaussianCloud) -> np.ndarray:
-    """(H, W, 2) pixels, optical flow from ``now`` to ``after``, blended like colour."""
+    """Return (H, W, 2), the optical flow in pixels from ``now`` to ``after``, blended like colour."""
     moved = projected(camera, after.means.numpy()) - projected(camera, now.means.numpy())
     reach = max(float(np.abs(moved).max()), 1e-6)
     colour = np.zeros((now.count, 1, 3))
@@ -58,7 +58,8 @@ def flow_to(camera: Camera, now: GaussianCloud, after: GaussianCloud) -> np.ndar
 
 
 def differences(camera: Camera, clouds: list[GaussianCloud], flows: list[np.ndarray]) -> np.ndarray:
-    """(F - 1,) root mean square difference between each frame and the next frame warped back by ``flows``."""
+    """Return (F - 1,), the root mean square difference between each frame and the next frame warped back by
+    ``flows``."""
     pictures = [render_gaussians(cloud, camera).colour.numpy() for cloud in clouds]
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(float)
     result = []

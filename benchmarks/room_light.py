@@ -7,7 +7,7 @@ the ground and its colours are compared with the results of the known light. ``b
 shadow straight below the object, and the captured colours.
 
 A point of the ground is in shadow if less than half of the light reaches it. Points in the shadow of other solids are
-ignored, and so are rooms in which the whole shadow lies there.
+ignored, and so are rooms in which they contain the whole shadow of the object.
 
 Aims: ``shadow_overlap`` (mean IoU of at least 0.6 over the lit rooms, and in none less than before), ``relit_psnr``
 (mean PSNR of the object at least 1.5 dB above that without relighting), ``clear`` (a light is found in at least nine

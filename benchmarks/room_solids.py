@@ -36,12 +36,12 @@ class Solid:
     is_box: bool = False
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """(n,) bool, True for ``points`` (n, 3) inside."""
+        """Return (n,) bool, True for ``points`` (n, 3) inside."""
         local = (points - self.centre) @ self.turn / self.half
         return np.abs(local).max(axis=1) < 1.0 if self.is_box else (local**2).sum(axis=1) < 1.0
 
     def is_hit(self, origins: np.ndarray, ray: np.ndarray) -> np.ndarray:
-        """(n,) bool, True where the half-line from ``origins`` (n, 3) along ``ray`` (3,) meets the solid."""
+        """Return (n,) bool, True where the half-line from ``origins`` (n, 3) along ``ray`` (3,) meets the solid."""
         start, along = (origins - self.centre) @ self.turn / self.half, ray @ self.turn / self.half
         if self.is_box:
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -140,7 +140,8 @@ def box(low: Sequence[float], high: Sequence[float], colour: Colour) -> Solid:
 
 
 def jittered_grid(half: np.ndarray, spacing: float, random: np.random.Generator) -> np.ndarray:
-    """(n, 2) points of a jittered grid in the rectangle with half sides ``half`` (2,), about ``spacing`` apart."""
+    """Return (n, 2) points of a jittered grid in the rectangle with half sides ``half`` (2,), about ``spacing``
+    apart."""
     counts = np.maximum(np.rint(2.0 * half / spacing).astype(int), 1)
     cells = np.indices(tuple(counts)).reshape(2, -1).T + random.uniform(0.15, 0.85, (int(counts.prod()), 2))
     return half * (2.0 * cells / counts - 1.0)

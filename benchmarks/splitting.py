@@ -62,7 +62,7 @@ def all_errors(opacity: float, rule: SplitRule, peaks: np.ndarray) -> np.ndarray
 
 
 def best_opacities(opacity: float) -> np.ndarray:
-    """(2,) outer and middle peak opacity of the three children, chosen to minimise the error."""
+    """Return (2,), the outer and middle peak opacity of the three children, chosen to minimise the error."""
 
     def residuals(logits: np.ndarray) -> np.ndarray:
         outer, middle = 1.0 / (1.0 + np.exp(-logits))

@@ -125,7 +125,7 @@ class Subject:
         return scenes.photographs(self.mesh, self.options.size, self.options.views, self.options.device)
 
     def moved_nodes(self) -> dict[str, np.ndarray]:
-        """(N, 3) positions of the cage's nodes in each motion; the drop is simulated with a coarse cage."""
+        """Return (N, 3), the positions of the cage's nodes in each motion; the drop is simulated with a coarse cage."""
         cached = self.options.clouds / f"{self.mesh.name}_drop.npz" if self.options.clouds else None
         if cached is not None and cached.exists():
             with np.load(cached) as arrays:

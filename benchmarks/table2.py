@@ -55,7 +55,7 @@ SEARCHES: tuple[Search, ...] = (*Strategy, *StateSearch)
 
 
 def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[Search, np.ndarray]:
-    """(frames, 4) for each search: QPs, objective, true objective, milliseconds."""
+    """Return (frames, 4) for each search: QPs, objective, true objective, milliseconds."""
     options: dict[str, Any] = {"directions": directions, "qp_limit": QP_LIMIT, "solver": solver}
     results = {}
     for kind in SEARCHES:
@@ -77,14 +77,14 @@ def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[Se
 
 
 def with_exact_forces(frame: Frame, x: np.ndarray) -> np.ndarray:
-    """(m + 3n,) activations of ``x`` (m + 3n,), and the forces of exact contact under these activations."""
+    """Return (m + 3n,), the activations of ``x`` (m + 3n,), and the forces of exact contact under these activations."""
     program = frame.program
     activations, forces = np.split(x, [program.activation_count])
     return np.concatenate([activations, contact_forces(program, activations, forces).ravel()])
 
 
 def contact_forces(program: CoulombProgram, activations: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """(n, 3) contact forces, body weights, that satisfy the contact laws under ``activations`` (m,)."""
+    """Return (n, 3), the contact forces, body weights, that satisfy the contact laws under ``activations`` (m,)."""
     m, n = program.activation_count, program.contact_count
     free = program.rows[:, :m] @ activations + program.offset
     delassus = program.rows[:, m:].copy()

@@ -91,7 +91,7 @@ def cameras_in(plane: Plane, located: LocatedPlane, side: int) -> list[Camera]:
 
 
 def picture(cloud: GaussianCloud, camera: Camera) -> np.ndarray:
-    """(H, W, 3) float32, 0 to 1: render of ``cloud`` on black."""
+    """Return (H, W, 3) float32, 0 to 1, the render of ``cloud`` on black."""
     return np.clip(render_gaussians(cloud, camera, background=BLACK).colour.numpy(), 0.0, 1.0)
 
 

@@ -34,8 +34,8 @@ RESTART_GAP = 1.2
 """A search restarts from other states, with ``RESTART_BUDGET`` times as many QPs, if the objective is more than this
 factor times its lower bound."""
 NEGLIGIBLE_GAIN = 0.01
-"""Fraction of the cost of doing nothing (no muscle forces and no contact forces). A search that could gain less does
-not restart."""
+"""Minimum possible gain for which a search restarts, as a fraction of the cost of doing nothing (no muscle forces and
+no contact forces)."""
 LOADED_FORCE = 1e-3
 """Minimum normal force of a loaded contact, body weights."""
 RESTART_BUDGET = 3

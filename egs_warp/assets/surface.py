@@ -218,7 +218,7 @@ def flat_gaussians(
         samples: n surface samples.
         sh: (n, k, 3) SH coefficients.
         random: Generator of the variation.
-        opacity: Mean opacity, in logit space.
+        opacity: Opacity, 0 to 1, whose logit is the mean of the logits.
         width: Standard deviation along the surface, in units of the spacing.
         thickness: Standard deviation along the normal, in units of the spacing.
         device: Warp device; None is the current one.

@@ -1,4 +1,4 @@
-"""Objects of a performance, and the handler that moves them with the time line."""
+"""Objects of a performance, and the handler that moves them with the timeline."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from .performance import BAND_0, Performance
 NAME = "egs_warp splats"
 """Name of the node group and of the material, which all creatures share."""
 _RADIUS = 3.0
-"""Radius of an ellipsoid, standard deviations; there, the opacity is 1 % of the opacity at the centre."""
+"""Radius of an ellipsoid, standard deviations; at this radius, the opacity is 1 % of the opacity at the centre."""
 _MOVING = ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 
 

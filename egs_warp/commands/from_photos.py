@@ -279,7 +279,7 @@ class _Run:
             elif args.yes:
                 print_note(f"using the object of {picked}")
             elif not pick_on_page(pick, film=args.motion):
-                raise UserError(f"{picked}: the page ended before Animate was pressed; repeat the command")
+                raise UserError(f"{picked}: the page was stopped before Animate was pressed; repeat the command")
 
     def _film(self, capture: Path, posed: Path | None) -> int:
         from egs_warp.commands.animate import run_animate

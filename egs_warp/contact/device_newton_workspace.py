@@ -313,7 +313,7 @@ class NewtonWorkspace:
         return [as_warp(self._progress[None], real), as_warp(self._loop_condition, wp.int32)]
 
     def _enqueue_next_step(self, dt: float, ratio: float) -> None:
-        """Take a Newton step from the last trial and update the loop condition."""
+        """Enqueue a Newton step from the last trial and an update of the loop condition."""
         self.target_forces.copy_(self.trial_parts()[3])
         self._previous_contact_velocities.copy_(self.free_contact_velocities)
         self.enqueue_newton(dt, ratio)
@@ -440,7 +440,7 @@ class NewtonWorkspace:
 
     def _enqueue_newton(self, state: torch.Tensor) -> None:
         """Compute the nodal velocities after a Newton step without contact forces from ``state``, and the contact
-        velocities there.
+        velocities after this step.
         """
         velocities, free_velocities, residual, _ = self.parts(state)
         self._enqueue_free_velocities(velocities, residual, free_velocities)

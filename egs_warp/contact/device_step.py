@@ -187,7 +187,7 @@ class StepWorkspace:
 
         Args:
             ends: (3N,) m, positions at the start of the next step.
-            velocities: (3N,) m/s, velocities there.
+            velocities: (3N,) m/s, velocities at the start of the next step.
             dt: step size, s.
             before: contact points (K,) int32 of the current step, their number (1,) int32 and their normal forces (K,)
                 newtons.

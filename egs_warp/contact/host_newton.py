@@ -103,7 +103,7 @@ class HostNewtonWorkspace:
         base: IterateBuffer,
         step: tuple[int, np.ndarray, float] | None = None,
     ) -> tuple[IterateBuffer, float]:
-        """Evaluate the residual at ``base``, or at a point on the Newton step from there.
+        """Evaluate the residual at ``base``, or at a point on the Newton step from ``base``.
 
         Args:
             problem: the step.

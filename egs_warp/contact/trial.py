@@ -73,7 +73,7 @@ class Trial(BatchedRecord):
     gradient: torch.Tensor
     """(c, N, 3) newtons, internal gradient."""
     torque: torch.Tensor
-    """(c, 3) N m, its torque about the centre of mass."""
+    """(c, 3) N m, torque of ``gradient`` about the centre of mass."""
     free_residual: torch.Tensor
     """(c, N, 3) N s, residual without contact forces."""
     residual: torch.Tensor

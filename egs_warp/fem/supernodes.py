@@ -36,7 +36,7 @@ class Supernodes:
     row_offsets: np.ndarray
     """(S + 1,) offset of each front in ``rows``."""
     rows: np.ndarray
-    """Rows of all fronts, ascending in each front."""
+    """(row_offsets[S],) rows of all fronts, ascending in each front."""
     parents: np.ndarray
     """(S,) parent of each block in the elimination tree, -1 for roots."""
 

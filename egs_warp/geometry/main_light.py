@@ -17,7 +17,7 @@ class MainLight:
     direction: np.ndarray
     """(3,) unit vector to the light."""
     half_angle: float
-    """Half of the apparent angular diameter of the light, degrees, which defines the softness of its shadow."""
+    """Half the angular diameter of the light, degrees; it determines the softness of the shadow."""
     shade: float
     """Fraction of the displayed brightness of the ground that the shadow removes, 0 to 1."""
     irradiance: np.ndarray

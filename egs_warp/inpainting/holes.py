@@ -25,14 +25,14 @@ from egs_warp.segmentation.votes import MaskedView, check_size
 _TEXELS = 256
 """Texels across the window on which a hole is drawn."""
 _CONTACT = 0.05
-"""Fraction of the object's height. The part of the object below this height hides the floor from every side."""
+"""Height below which a part of the object hides the floor from every side, as a fraction of the object's height."""
 _LOW = 0.08
-"""Fraction of the object's size. Under parts of the object that are lower than this, the floor is unseen, or seen only
-at grazing angles and smeared."""
+"""Height, as a fraction of the object's size, below which parts of the object hide the floor under them, or leave it
+visible only at grazing angles and smeared."""
 _LOW_TEXELS = 200
 """Texels across the window of the hole under an object."""
 _BRIDGED = 0.1
-"""Fraction of the footprint's span. Gaps up to twice as wide are bridged."""
+"""Half of the maximum width of gaps in the footprint that are bridged, as a fraction of the footprint's span."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Hole:
         return cls(PlaneWindow(plane, outline.centre, outline.texel, rows, columns), mask > 0)
 
     def drawn_on(self, window: PlaneWindow) -> np.ndarray:
-        """(rows, columns) bool, the hole resampled on another window of the same plane."""
+        """Return (rows, columns) bool, the hole resampled on another window of the same plane."""
         columns, rows = np.meshgrid(np.arange(window.columns) + 0.5, np.arange(window.rows) + 0.5)
         places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
         at = self.window.pixels(places) - 0.5
@@ -198,7 +198,8 @@ def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
 
 
 def _on_plane(plane: Plane, camera: Camera, mask: np.ndarray) -> np.ndarray:
-    """(n, 3) points where the rays through the pixels of ``mask`` meet the plane; rays that miss it are left out."""
+    """Return (n, 3) points where the rays through the pixels of ``mask`` meet the plane; rays that miss it are left
+    out."""
     rays = camera_rays(camera)[mask]
     slope = rays @ plane.normal
     height = float(plane.heights(camera.centre))

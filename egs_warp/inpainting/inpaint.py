@@ -31,16 +31,16 @@ _MARGIN = 0.01
 hole's edge. Gaps in the floor that touch the hole are always added. With 0.03 and more, a sheet under a plush toy lost
 part of its edge."""
 _THICKNESS = 0.15
-"""Fraction of the hole's side. Gaussians within this distance of the plane are floor."""
+"""Distance from the plane within which Gaussians are floor, as a fraction of the hole's side."""
 _HAZE = 0.25
-"""Fraction of the hole's side. Gaussians over the hole that are lower than this are floor, or haze at the object's
-foot."""
+"""Height below which Gaussians over the hole are floor, or haze at the object's foot, as a fraction of the hole's
+side."""
 _KNOWN = 0.6
 """Minimum opacity of the floor at which its colour is known."""
 _SOLID = 0.3
 """Minimum opacity of a Gaussian that is floor."""
 _TEXELS_ACROSS = 120.0
-"""Texels along the side of the hole, whatever its size, so that the computing time does not depend on the size."""
+"""Number of texels along the side of a hole of any size, so that the computing time does not depend on the size."""
 _WINDOW = 3.0
 """Side of the window as a multiple of the hole's side. The window contains the hole and the floor to copy from."""
 _SHARPNESS = 0.5
@@ -58,7 +58,7 @@ _CHANNEL = 9.0
 _MIN_RIM_FRACTION = 0.4
 """Minimum fraction of the hole's edge that must be floor."""
 _MAX_ISLAND_AREA = 0.15
-"""Fraction of the hole's area. A smaller island of floor inside the hole is discarded."""
+"""Area below which an island of floor inside the hole is discarded, as a fraction of the hole's area."""
 _COLOUR_WEIGHT = 4.0
 """Weight of the squared distance between a Gaussian's colour and the painted colour."""
 _PAINTING = 0.5
@@ -217,7 +217,7 @@ def _window_around(background: GaussianCloud, hole: Hole, margin: float) -> tupl
 def _in_hole(
     background: GaussianCloud, window: PlaneWindow, mask: np.ndarray, side: float, *, depth: float = 1.0
 ) -> np.ndarray:
-    """(n,) bool, True for Gaussians in the hole of the ``mask``: floor, haze over it, and Gaussians under it.
+    """Return (n,) bool, True for Gaussians in the hole of the ``mask``: floor, haze over it, and Gaussians under it.
 
     Gaussians that hang higher are not included. Gaussians below the plane are included down to ``depth`` times the
     ``side`` of the hole (scene units), because they are visible beyond the edge of a thin floor.
@@ -264,8 +264,8 @@ def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) 
 
 
 def _void(missing: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool, the part of the ``missing`` floor that lies beyond the floor's edge. Parts connected to it
-    only by a narrow channel are gaps and are not included."""
+    """Return (rows, columns) bool, the part of the ``missing`` floor that lies beyond the floor's edge. Parts connected
+    to it only by a narrow channel are gaps and are not included."""
     wide, _ = connected_parts(depth_inside(np.pad(missing, 1, mode="edge")) > _CHANNEL)
     edges = np.concatenate([wide[0], wide[-1], wide[:, 0], wide[:, -1]])
     outside = np.isin(wide, np.unique(edges[edges > 0]))[1:-1, 1:-1]

@@ -82,7 +82,7 @@ class OnnxInpainter:
     def fill(
         self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
     ) -> np.ndarray:
-        """Fill the hole; see ``Inpainter.fill``. Raises ``UserError`` if the file is not such a network."""
+        """Fill the hole; see ``Inpainter.fill``. Raises ``UserError`` if the file is not an inpainting network."""
         file, network = self._load()
         picture, missing = _padded(image, hole, known)
         masks = [name for name in file.inputs if "mask" in name.lower()]
@@ -123,7 +123,7 @@ class TorchScriptInpainter:
     def fill(
         self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
     ) -> np.ndarray:
-        """Fill the hole; see ``Inpainter.fill``. Raises ``UserError`` if the file is not such a network."""
+        """Fill the hole; see ``Inpainter.fill``. Raises ``UserError`` if the file is not an inpainting network."""
         torch, network = self._load()
         picture, missing = _padded(image, hole, known)
         try:

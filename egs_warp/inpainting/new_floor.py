@@ -34,8 +34,8 @@ _GLOSS_CELL = 4.0
 
 
 def rim_heights(before: RectifiedImage, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """(rows, columns) height of the new floor above the plane: the solution of Laplace's equation in the hole, with the
-    heights of its rim as boundary values.
+    """Return (rows, columns), the height of the new floor above the plane: the solution of Laplace's equation in the
+    hole, with the heights of its rim as boundary values.
 
     A real floor differs from the fitted plane; without this correction, the edge of the new floor would be a step that
     is visible in low views.

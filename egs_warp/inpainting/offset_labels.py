@@ -21,7 +21,7 @@ _PIECES = (5, 10)
 _RING = 6
 """Width in pixels of the ring around the hole that is compared."""
 _MIN_PIXELS = 15
-"""Minimum number of pixels in such a part."""
+"""Minimum number of pixels in a part of the rim."""
 _OFFSETS_PER_PIXEL = 3
 """Number of best offsets at each pixel; an offset that is never among them is discarded."""
 _RIM = 3
@@ -148,8 +148,8 @@ def _label(
     domain: np.ndarray,
     offsets: Offsets,
 ) -> np.ndarray:
-    """(n, 2) offset of each pixel of ``domain`` (n, 2), found by expansion moves over ``offsets`` and over additional
-    offsets that provide missing colours."""
+    """Return (n, 2), the offset of each pixel of ``domain`` (n, 2), found by expansion moves over ``offsets`` and over
+    additional offsets that provide missing colours."""
     in_hole = hole[domain[:, 0], domain[:, 1]]
     colours = RimColours(image, known & ~hole, domain)
     place, allowed = _places(domain, offsets, is_source)
@@ -246,7 +246,8 @@ def _places(domain: np.ndarray, offsets: Offsets, is_source: np.ndarray) -> tupl
 def _surround_error(
     image: np.ndarray, hole: np.ndarray, known: np.ndarray, domain: np.ndarray, offsets: Offsets
 ) -> np.ndarray:
-    """(n, k) mean colour difference of each offset over the known surroundings of each pixel of ``domain`` (n, 2)."""
+    """Return (n, k), the mean colour difference of each offset over the known surroundings of each pixel of ``domain``
+    (n, 2)."""
     width = float(depth_inside(hole).max())
     margin = int(2 * width) + 4
     low = np.maximum(domain.min(axis=0) - margin, 0)
@@ -268,7 +269,7 @@ def _surround_error(
 
 
 def _cut(unary: np.ndarray, p: np.ndarray, q: np.ndarray, pairwise: np.ndarray) -> np.ndarray:
-    """(n,) bool x that minimises sum unary x + sum pairwise (1 - x_p) x_q, by maximum flow."""
+    """Return (n,) bool, the labels x that minimise sum unary x + sum pairwise (1 - x_p) x_q, by maximum flow."""
     count = len(unary)
     source, sink = count, count + 1
     plus, minus = np.flatnonzero(unary > 0), np.flatnonzero(unary < 0)

@@ -133,7 +133,7 @@ def _with_half_turn(
 
 
 def _start(level: _Level, shift_limit: float) -> np.ndarray:
-    """(H, W, 2) int32, a source with a whole known patch for each pixel, from the offsets that match the rim."""
+    """Return (H, W, 2) int32, a source with a whole known patch for each pixel, from the offsets that match the rim."""
     sources = labelled_sources(level.image, level.hole, level.known, level.is_source, shift_limit=shift_limit)
     return _with_whole_patches(sources, level)
 
@@ -257,5 +257,5 @@ class _Work:
         self._image = wp.array(self.picture, dtype=wp.vec3, device=self._device)
 
     def sources(self) -> np.ndarray:
-        """(H, W, 2) int32, row and column of each source."""
+        """Return (H, W, 2) int32, the row and column of each source."""
         return self._sources.numpy()

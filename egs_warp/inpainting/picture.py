@@ -15,7 +15,7 @@ _DISTANCE = 3.2
 
 
 def before_and_after(result: InpaintResult, *, size: int = 384) -> np.ndarray:
-    """(2 size, 4 size, 3) uint8: the scene before and after, and the depth of the new floor, from two sides; and
+    """Return (2 size, 4 size, 3) uint8: the scene before and after, and the depth of the new floor, from two sides; and
     face-on pictures of the floor before and after."""
     kept = result.cloud.subset(~result.is_new)
     tiles, labels = [], []
@@ -30,8 +30,8 @@ def before_and_after(result: InpaintResult, *, size: int = 384) -> np.ndarray:
 
 
 def depth_colours(depth: np.ndarray, near: float | None = None, far: float | None = None) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: near is dark blue, far is yellow, empty is white. The range defaults to the range of
-    ``depth``."""
+    """Return the colours (H, W, 3) uint8 RGB: near is dark blue, far is yellow, empty is white. The range defaults to
+    the range of ``depth``."""
     seen = depth > 0.0
     if not seen.any():
         return np.full((*depth.shape, 3), 255, np.uint8)

@@ -60,7 +60,8 @@ class PlaneWindow:
         return 0.5 * self.texel * max(self.rows, self.columns)
 
     def pixels(self, points: np.ndarray) -> np.ndarray:
-        """(n, 2) float64, column and row of ``points`` (n, 3) projected onto the plane; texel centres are at +0.5."""
+        """Return (n, 2) float64, the column and row of ``points`` (n, 3) projected onto the plane; texel centres are at
+        +0.5."""
         first, second = self.plane.tangents()
         away = np.asarray(points, float) - self.centre
         return np.stack(
@@ -68,13 +69,13 @@ class PlaneWindow:
         )
 
     def points(self, pixels: np.ndarray) -> np.ndarray:
-        """(n, 3) points on the plane at (n, 2) columns and rows; the inverse of the method ``pixels``."""
+        """Return (n, 3) points on the plane at (n, 2) columns and rows; the inverse of the method ``pixels``."""
         first, second = self.plane.tangents()
         x, y = (np.asarray(pixels, float) - [0.5 * self.columns, 0.5 * self.rows]).T * self.texel
         return self.centre + x[:, None] * first - y[:, None] * second
 
     def sample(self, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """(n,) bool, values of ``mask`` (rows, columns) at ``points`` (n, 3) projected onto the plane; False
+        """Return (n,) bool, values of ``mask`` (rows, columns) at ``points`` (n, 3) projected onto the plane; False
         outside."""
         column, row = np.floor(self.pixels(points)).astype(int).T
         inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
@@ -140,7 +141,8 @@ class RectifiedImage:
 
 
 def mean_colours(cloud: GaussianCloud, plane: Plane) -> np.ndarray:
-    """(n, 3) float32, colour of each Gaussian, averaged over directions from all around the plane, not clipped."""
+    """Return (n, 3) float32, the colour of each Gaussian, averaged over directions from all around the plane, not
+    clipped."""
     first, second = plane.tangents()
     angle = 2.0 * np.pi * np.arange(8)[:, None] / 8
     level = np.cos(angle) * first + np.sin(angle) * second
@@ -168,7 +170,7 @@ def rectify(cloud: GaussianCloud, window: PlaneWindow, *, thickness: float) -> R
 
     Height and opacity come from a view straight down. The colour is the mean of side views, each projected onto the
     surface at that height, plus the detail of the side view with median contrast. The view straight down is not used
-    for colour: no photo was taken from there, and a capture shows disordered threads and gaps.
+    for colour: no photo was taken from above, and a capture shows disordered threads and gaps.
     """
     shape = (window.rows, window.columns)
     chosen = near_plane(cloud, window.plane, thickness)
@@ -188,7 +190,8 @@ def rectify(cloud: GaussianCloud, window: PlaneWindow, *, thickness: float) -> R
 def _from_all_around(
     floor: GaussianCloud, window: PlaneWindow, solid: np.ndarray, height: np.ndarray, otherwise: np.ndarray
 ) -> np.ndarray:
-    """(rows, columns, 3) colour of the ``floor`` from side views.
+    """Return (rows, columns, 3), the colour of the ``floor`` from side views.
+
     Args:
         floor: its Gaussians.
         window: the window on the plane.
@@ -218,8 +221,8 @@ def _from_all_around(
 
 
 def _detail(colour: np.ndarray, opacity: np.ndarray) -> np.ndarray:
-    """(rows, columns, 3) structure finer than ``_DETAIL`` in ``colour`` (rows, columns, 3), where its ``opacity``
-    (rows, columns) is above one half."""
+    """Return (rows, columns, 3) structure finer than ``_DETAIL`` in ``colour`` (rows, columns, 3), where its
+    ``opacity`` (rows, columns) is above one half."""
     dense = opacity > 0.5
     share = np.maximum(ndimage.gaussian_filter(dense.astype(float), _DETAIL), _MIN_ALPHA)
     broad = ndimage.gaussian_filter(colour * dense[..., None], (_DETAIL, _DETAIL, 0.0)) / share[..., None]
@@ -230,7 +233,7 @@ def _side_view(
     floor: GaussianCloud, window: PlaneWindow, places: np.ndarray, azimuth: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return colour times opacity (rows, columns, 3) and opacity (rows, columns) of the ``floor`` at ``places`` (rows *
-    columns, 3), seen from ``azimuth``."""
+    columns, 3), seen from ``azimuth``, rad."""
     camera = window.camera_from(azimuth)
     image = render_gaussians(floor, camera, background=(0.0, 0.0, 0.0))
     x, y, z = camera.rotation @ places.T + camera.translation[:, None]

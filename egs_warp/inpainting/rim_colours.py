@@ -12,8 +12,8 @@ from egs_warp.geometry.laplace_fill import laplace_fill
 _SHADE = 0.1
 """Colours closer to each other than this belong to the same shade."""
 _LINE = 5
-"""Pixels. Structure narrower than half of this is not tested, because a line may cross a hole although little of the
-rim has its colour."""
+"""Aperture of the median filter, pixels. Structure narrower than half of this is not tested, because a line may cross a
+hole although little of the rim has its colour."""
 _COMMON = 0.55
 """Minimum likelihood of a colour that may form an island, relative to the most likely colour."""
 _PATTERN = 0.5
@@ -44,11 +44,11 @@ class RimColours:
         self._common = (film > _COMMON * top) | (top < _PATTERN)
 
     def common(self, place: np.ndarray) -> np.ndarray:
-        """(n, k) bool, True if the colour at ``place`` (n, k, 2) is not unusual at the pixel of the domain."""
+        """Return (n, k) bool, True if the colour at ``place`` (n, k, 2) is not unusual at the pixel of the domain."""
         return np.take_along_axis(self._common, self._shade[place[..., 0], place[..., 1]], axis=1)
 
     def islands(self, place: np.ndarray) -> np.ndarray:
-        """(n,) bool, True for pixels of an unusual colour in an island, or in a tongue longer than it is wide.
+        """Return (n,) bool, True for pixels of an unusual colour in an island, or in a tongue longer than it is wide.
 
         The pixels of the domain are painted with the colours at ``place`` (n, 2). A region that reaches the rim in two
         places is not an island.

@@ -15,11 +15,12 @@ from egs_warp.geometry.bitmaps import connected_parts, distance_to
 from egs_warp.geometry.laplace_fill import laplace_fill
 
 _BLUR = 2.0
-"""Texels, standard deviation of the blur that removes the floor's texture."""
+"""Standard deviation in texels of the blur that removes the floor's texture."""
 _BROAD = 12.0
-"""Texels, standard deviation of the blur for the expected brightness of the floor; light changes slowly."""
+"""Standard deviation in texels of the blur for the expected brightness of the floor; light changes slowly."""
 _DARKER = 0.2
-"""Difference of the natural logarithm of brightness. Weaker darkening is hardly visible."""
+"""Minimum darkening of a stain, as a difference of the natural logarithm of brightness. Weaker darkening is hardly
+visible."""
 _SHADE, _SHADE_BLUR = 0.1, 4.0
 """Difference of the natural logarithm of brightness, and standard deviation of a blur in texels. Floor whose blurred
 brightness is lower than predicted by more than this difference is not copied."""
@@ -42,15 +43,15 @@ _ROUNDS = 4
 """Maximum number of rounds. The floor from which brightness is predicted may itself be stained, until an earlier round
 has added that stain to the hole."""
 _FEW = 20
-"""Texels. The search ends when a round adds fewer."""
+"""Minimum number of texels that a round must add for the search to continue."""
 _REACH = 60.0
-"""Texels, equal to half of the hole's side: maximum distance of a stain's texels from the hole."""
+"""Maximum distance of a stain's texels from the hole, in texels: half of the hole's side."""
 _MAX_AREA = 2.0
 """Maximum area of a stain, as a multiple of the hole's area; a larger region is another part of the floor."""
 
 
 def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool, the stained part of the floor.
+    """Return (rows, columns) bool, the stained part of the floor.
 
     A stain is connected to the hole and, in at least one channel, darker than predicted from the floor farther out. The
     prediction uses the half of the floor that is farther from the hole; this half is never stained. Regions that extend
@@ -77,7 +78,7 @@ def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.
 
 
 def _next_to(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool, the stained part of the nearer half of the floor."""
+    """Return (rows, columns) bool, the stained part of the nearer half of the floor."""
     floor = known & ~hole
     if not floor.any():
         return np.zeros_like(hole)
@@ -95,7 +96,7 @@ def _next_to(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndar
 
 
 def shaded(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool, the part of the ``known`` (rows, columns) floor whose mean brightness is lower than
+    """Return (rows, columns) bool, the part of the ``known`` (rows, columns) floor whose mean brightness is lower than
     predicted from the floor farther from the ``hole`` (rows, columns).
 
     It need not be a stain, but copies of it would bring shadows to lit places.
@@ -127,7 +128,8 @@ def _unexpected(
 
 
 def _common(colours: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """(n,) bool, True for ``colours`` (n, 3) that are common among the ``floor``'s (m, 3); all are logarithms."""
+    """Return (n,) bool, True for ``colours`` (n, 3) that are common among the ``floor``'s (m, 3); all are
+    logarithms."""
     few = floor[:: -(-len(floor) // _SAMPLE)]
     alike = KDTree(few).query_ball_point(colours, _ALIKE, p=np.inf, return_length=True)
     return np.asarray(alike) >= _COMMON * len(few)

@@ -16,15 +16,15 @@ from egs_warp.inpainting.new_floor import flat_gaussians
 from egs_warp.inpainting.rectified import PlaneWindow
 
 _LOW = 0.03
-"""Fraction of the object's size. Gaussians lower than this above the ground are the object's rim."""
+"""Height above the ground below which Gaussians are the object's rim, as a fraction of the object's size."""
 _TEXELS = 128
 """Texels across the rim."""
 _SPACING = 2
 """Minimum number of texels between new Gaussians."""
 _MAX_GROWTH = 0.2
-"""Maximum number of new Gaussians, as a fraction of the object's."""
+"""Maximum number of new Gaussians, as a fraction of the number in the object."""
 _BRIDGED = 8.0
-"""Texels. Gaps in the rim up to twice this width are bridged."""
+"""Half of the maximum width, in texels, of gaps in the rim that are bridged."""
 _REACH = 2.0
 """Radius, in standard deviations of a splat, of the region around its mean that it covers."""
 _FOOT = 0.05
@@ -35,7 +35,7 @@ def with_underside(object_cloud: GaussianCloud, ground: HeightField, size: float
     """Return the object with flat Gaussians over the opening that its rim at the ground encloses, and their number.
 
     Heights and colours solve Laplace's equation with the rim's values as boundary values. The number of new Gaussians
-    is at most a fifth of the object's.
+    is at most a fifth of the number in the object.
 
     Args:
         object_cloud: Gaussians of the object, scene units.

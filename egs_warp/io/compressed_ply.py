@@ -80,7 +80,7 @@ def decode_compressed_ply(data: bytes, header: PlyHeader, source: Path) -> RawCa
     limits = np.tile(np.array([0, 0, 0, 1, 1, 1], np.float32), (len(chunk), 3))
     limits[:, : len(bounds)] = columns_as_float32(chunk, bounds)
     limits = limits.reshape(-1, 3, 2, 3)[np.arange(len(vertex)) // _CHUNK]
-    # The packed integers of a text .ply are float64, and those of a big-endian .ply have its byte order.
+    # Packed integers are float64 if read from a text .ply, and big-endian if read from a big-endian .ply.
     words = {name: vertex[name].astype(np.uint32) for name in _PACKED}
     means = _between(limits[:, 0], _fields(words["packed_position"], _POSITION_FIELDS))
     log_scales = _between(limits[:, 1], _fields(words["packed_scale"], _POSITION_FIELDS))

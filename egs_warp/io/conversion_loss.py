@@ -132,14 +132,14 @@ def _position_errors(old: _Block, new: _Block) -> np.ndarray:
 
 
 def _size_errors(old: _Block, new: _Block) -> np.ndarray:
-    """Return the maximum change of a standard deviation, percent of the Gaussian's largest standard deviation, because
-    a slight change of the thickness of a flat Gaussian is not visible."""
+    """Return (n,) the largest change of a standard deviation of each Gaussian, in percent of its largest standard
+    deviation: a small change of the thickness of a flat Gaussian is not visible."""
     before, after = (np.exp(block.log_scales.astype(np.float64)) for block in (old, new))
     return 100.0 * np.abs(after - before).max(axis=1) / before.max(axis=1)
 
 
 def _rotation_errors(old: _Block, new: _Block) -> np.ndarray:
-    """Return the angles between the rotations, degrees. A quaternion and its negative are the same rotation."""
+    """Return the angles (n,) between the rotations, degrees. A quaternion and its negative are the same rotation."""
     a, b = old.rotations.astype(np.float64), new.rotations.astype(np.float64)
     chord = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
     return 4.0 * np.degrees(np.arcsin(np.minimum(0.5 * chord, 1.0)))

@@ -36,7 +36,7 @@ _READ = (EXTENSION, *_SPZ, _SPZ_ALONE, INSTANCING, _QUANTIZED)
 _SURFACES = ("KHR_materials_", "EXT_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
 """Prefixes of extensions that only change the appearance of meshes."""
 _MAX_COPIES = 1 << 21
-"""Maximum number of Gaussians that instances add to those of the file."""
+"""Maximum number of Gaussians that instances may add to the Gaussians stored in the file."""
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 """Magic number of a .glb, and types of its two chunks."""
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -240,8 +240,8 @@ class _Asset:
     def _packed(self, primitive: dict[str, Any], packed: dict[str, Any]) -> _Splats:
         """Decode a .spz.
 
-        Its axes are those of the mesh or, as the draft demands and few tools implement, rotated about y. The bounds of
-        ``POSITION`` decide between both.
+        Its axes are the axes of the mesh or, as the draft demands and few tools implement, these axes rotated about y.
+        The bounds of ``POSITION`` decide between the two.
         """
         view = self.tree["bufferViews"][packed["bufferView"]]
         start, size = view.get("byteOffset", 0), view["byteLength"]

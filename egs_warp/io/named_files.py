@@ -48,8 +48,7 @@ def named_files(*paths: Path, overwrite: bool = False) -> Iterator[NamedFiles]:
 
 
 def check_named_files(*paths: Path, overwrite: bool = False) -> None:
-    """Raise the ``UserError`` of ``named_files``, as far as it can be predicted, before any long computation and
-    without creating anything."""
+    """Raise the predictable errors of ``named_files`` before any long computation and without creating anything."""
     for path in paths:
         check_out(path.parent)
         if path.is_dir():

@@ -24,7 +24,7 @@ def orientation(image: Path) -> int:
 
 
 def apply_orientation(pixels: np.ndarray, turn: int) -> np.ndarray:
-    """Return ``pixels`` (H, W, ...) rotated and mirrored according to the EXIF orientation ``turn``."""
+    """Return stored ``pixels`` (H, W, ...) turned upright according to the EXIF orientation ``turn`` (1 to 8)."""
     if turn >= 5:
         pixels = pixels.swapaxes(0, 1)
     # Directions in which rows and columns are read after the axes have been swapped.

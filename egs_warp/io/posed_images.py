@@ -48,7 +48,7 @@ class ExcludedPhoto:
 
     name: str
     reason: str
-    """Reason of the exclusion, for the user."""
+    """Reason for the exclusion, for the user."""
 
 
 @dataclass(frozen=True)

@@ -198,8 +198,8 @@ def has_finished(out: Path | str) -> bool:
 
 
 def check_run_folder(out: Path | str, *, overwrite: bool = False, writes: Sequence[str] = ()) -> None:
-    """Raise the errors of ``run_folder``, and of its method ``file`` for the files that the run ``writes``, as far as
-    they can be predicted, before any long computation and without creating anything."""
+    """Raise the predictable errors of ``run_folder``, and of its method ``file`` for the files that the run ``writes``,
+    before any long computation and without creating anything."""
     check_out(out)
     if Path(out).suffix.lower() in _FILE_ENDINGS and not Path(out).is_dir():
         problem = f"the results are a folder of files; give a name without {Path(out).suffix}"

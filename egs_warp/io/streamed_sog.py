@@ -62,8 +62,12 @@ def _part(files: SogFiles, name: str, ranges: list[tuple[int, int]]) -> RawCaptu
     if PurePosixPath(name).name != "meta.json":
         raise UserError(f"{files.source}: lod-meta.json names {name!r}, expected a meta.json; export the capture again")
     part = decode_sog(files.read(name), SogFiles(files.source, lambda file: files.read(str(folder / file))))
-    if max(end for _, end in ranges) > len(part.means):
-        raise UserError(f"{files.source}: truncated: {name} has {len(part.means)} Gaussians; export the capture again")
+    needed = max(end for _, end in ranges)
+    if needed > len(part.means):
+        raise UserError(
+            f"{files.source}: truncated: {name} has {len(part.means)} Gaussians, expected at least {needed}; export the"
+            " capture again"
+        )
     # Check this before indices are allocated, because there may be many overlapping leaves in a crafted file.
     if sum(end - start for start, end in ranges) > len(part.means):
         raise UserError(f"{files.source}: leaves of {name} overlap in lod-meta.json; export the capture again")

@@ -57,7 +57,7 @@ class EnergyBalance:
     damping: np.ndarray
     """(F,) dissipation of the material."""
     drag: np.ndarray
-    """(F,) work of the drag of the air."""
+    """(F,) work of air drag."""
     friction: np.ndarray
     """(F,) work of tangential contact forces."""
     contact: np.ndarray

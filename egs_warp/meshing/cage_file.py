@@ -18,7 +18,8 @@ _FORMATS = (".mesh", ".msh", ".vtu")
 _MAX_BYTES = 64 * 2**20
 """Maximum size of a file, bytes; ``MAX_NODES`` nodes need some 10 MB as text."""
 _BELOW_GROUND = 0.01
-"""Maximum depth of a node below the ground, in heights of the mesh; nodes below the ground are moved to it."""
+"""Maximum depth of a node below the ground, as a fraction of the height of the mesh. Nodes below the ground are moved
+up to it."""
 
 
 def read_cage_mesh(path: Path) -> TetMesh:
@@ -75,8 +76,8 @@ def read_cage_in(path: Path, frame: BodyFrame) -> TetMesh:
     if nodes[lowest, 2] < -_BELOW_GROUND * height:
         x, y, z = mesh.nodes[lowest]
         raise UserError(
-            f"{path}: the node at [{x:g}, {y:g}, {z:g}] is {-nodes[lowest, 2] / height:.2g} heights of the mesh below"
-            " the ground; move it up, and give coordinates of the capture"
+            f"{path}: the node at [{x:g}, {y:g}, {z:g}] is below the ground by {-nodes[lowest, 2] / height:.2g} times"
+            " the height of the mesh; move it up, and check that the mesh is in the capture's coordinates"
         )
     nodes[:, 2] = np.maximum(nodes[:, 2], 0.0)
     return TetMesh.oriented(nodes, mesh.tets)

@@ -105,7 +105,7 @@ def _cuts(mesh: TetMesh, distances: np.ndarray, edge: float) -> Iterator[tuple[f
     """Yield distance (m), volume behind, and area of cuts at increasing distances from a tip.
 
     The unit of volume is the volume V of the body, the unit of area is V^(2/3). The area of a cut is the mean over a
-    slab of thickness ``edge`` (m). ``distances`` (N,) m are those of the nodes from the tip.
+    slab of thickness ``edge`` (m). ``distances`` (N,) m are the distances of the nodes from the tip.
     """
     n = _LATTICE
     cells = np.array([(i, j, k) for i in range(n) for j in range(n - i) for k in range(n - i - j)])

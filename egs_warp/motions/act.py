@@ -143,7 +143,8 @@ class _Layer:
                 self._reached[k] = max(self._reached[k], value)
 
     def _value(self, index: int, state: BodyState) -> np.ndarray:
-        """Return the measured value (3,) of a channel."""
+        """Return the measured value (3,) of channel ``index``, in ground axes: body heights for a position, a rotation
+        vector in degrees for an orientation."""
         part, ground = self.gesture.parts[index], self._ground
         if self.gesture.channels[index].quantity is Quantity.POSITION:
             com, start = (self._body.centre_of_mass(x) for x in (state.positions, self._standing))

@@ -138,7 +138,7 @@ class Crawl:
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the body lies still at the end of its route."""
+        """True if the last round is over and the body lies still."""
         return self._is_resting
 
     def plan_record(self) -> CrawlPlan:

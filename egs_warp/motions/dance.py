@@ -129,8 +129,8 @@ class _Step:
         self._left, self._touched = None, now
 
     def flight(self) -> tuple[float, float] | None:
-        """Return the times of take-off and touch-down; None if the body has not been in the air. They are those of the
-        longest flight, because a brief contact with the ground is not a landing."""
+        """Return the times of take-off and touch-down of the longest flight, because a brief contact with the ground is
+        not a landing. Return None if the body has not been in the air."""
         return max(self._airborne, key=lambda span: span[1] - span[0], default=None)
 
     def events(self) -> list[Event]:

@@ -33,7 +33,7 @@ from egs_warp.motions.support import nearest_in_half_planes
 from egs_warp.motions.walk_posture import LeggedPosture, select_posture
 
 STOP_RISE_FRACTION = 0.94
-"""Fraction of the requested height: a thrust ends when the centre of mass would reach it in free flight. One more time
+"""Fraction of the requested height that the centre of mass would reach in free flight when a thrust ends. One more time
 step would exceed the requested height."""
 AIM_RISE_FRACTION = 0.99
 """Target of a thrust, as a fraction of the requested height. It exceeds ``STOP_RISE_FRACTION``, so that the thrust also
@@ -153,7 +153,7 @@ class Jump:
 
     @property
     def is_airborne(self) -> bool:
-        """True if the reference frame is the frame of the landing."""
+        """True from take-off on: the reference frame is the frame of the landing."""
         return self.controller is self._landing
 
     @property
@@ -244,7 +244,8 @@ class Jump:
             self.phase = list(JumpPhase)[list(JumpPhase).index(self.phase) + 1]
             self._entered, self._pose_before = time, self._last_pose
         if self.phase is JumpPhase.FLIGHT and not self.is_airborne:
-            # Poses are relative to the standing pose, which is rotated in the frame of the landing.
+            # Poses are stored relative to the standing pose. The landing frame is rotated against the take-off frame,
+            # so rotate the stored poses into it.
             rotation = self.ground.rotation_about_up(self.facing.target_heading)
             self._last_pose, self._pose_before = self._last_pose @ rotation.T, self._pose_before @ rotation.T
             self.controller = self._landing
@@ -252,7 +253,8 @@ class Jump:
             self.phase = JumpPhase.REST
 
     def _is_thrust_done(self, measurement: Measurement, dt: float) -> bool:
-        """Return True if the centre of mass would reach the requested height in free flight."""
+        """Return True if the thrust is over: the centre of mass would reach ``STOP_RISE_FRACTION`` of the requested
+        height in free flight, or the body has left the ground."""
         speed = max(measurement.velocity[2] - 0.5 * self.gravity * dt, 0.0)
         apex = measurement.com[2] + speed**2 / (2.0 * self.gravity)
         enough = bool(apex >= self._start_com[2] + STOP_RISE_FRACTION * self.target.height)

@@ -225,8 +225,8 @@ def _key(entry: Mapping[str, Any], where: str) -> Key:
     part, quantity, value = entry["part"], entry["quantity"], entry["value"]
     if part not in PARTS and not (isinstance(part, str) and _NUMBERED_PART.fullmatch(part)):
         raise UserError(
-            f"{where}: part {part!r} is unknown{did_you_mean(part, PARTS)}; give one of {', '.join(PARTS)}, or of"
-            " several feet foot 1, foot 2, ..., or a branch, branch 1, ..."
+            f"{where}: part {part!r} is unknown{did_you_mean(part, PARTS)}; give one of {', '.join(PARTS)}, or a"
+            " numbered part: foot 1, foot 2, ... if there are several feet, or branch 1, branch 2, ..."
         )
     names = [member.value for member in Quantity]
     if quantity not in names:

@@ -292,8 +292,9 @@ class _Graph:
         return level_counts, own, last, met
 
     def bases(self, limbs: Sequence[_Limb]) -> np.ndarray:
-        """Return the index of the foot (limbs,) of each limb. Limbs share a foot if they are connected on the ground
-        over a large height, or by a bar without another limb between them."""
+        """Return (limbs,) int, the index of the foot of each limb. Limbs share a foot if their connection near the
+        ground is high, or if they are farther apart than ``_MAX_GAP`` and the connection is a bar without another limb
+        between them."""
         if not limbs:
             return np.zeros(0, int)
         under = [self._ground_under(limb) for limb in limbs]

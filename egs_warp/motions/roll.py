@@ -163,7 +163,7 @@ class Roll:
         return self.table.at(elapsed + dt)
 
     def _is_over(self, com: np.ndarray, elapsed: float) -> bool:
-        """Return True if the end of the route is reached."""
+        """Return True if the planned time has passed and the centre of mass is near the end of the route."""
         error = float(np.linalg.norm(self._start + self.table.at(np.inf).position - com[:2]))
         return elapsed >= self.table.seconds and error <= _ARRIVAL_TOLERANCE * self.body.height
 

@@ -23,7 +23,7 @@ _TURN = np.radians(12.0)
 """Angle in radians by which the body is turned to either side of its direction."""
 _MIN_CONTACT_TIME, _MAX_MARGIN = 0.3, 0.5
 """Conditions for the next jump of a landed body: minimum time since the landing, in sqrt(H / g), and maximum distance
-of the capture point from the middle of the feet, relative to the distance of their edge."""
+of the capture point from the middle of the feet, as a fraction of the distance to their edge."""
 
 
 @dataclass(frozen=True)

@@ -268,8 +268,8 @@ class BalanceController:
         return -2.0 * pendulum * (self._capture(measurement) - goal) + pendulum * (measurement.com[:2] - goal)
 
     def capture_margin(self, measurement: Measurement) -> float:
-        """Return the distance of the capture point from the middle of the support, relative to the distance of the edge
-        in the same direction. Beyond 1, the body falls unless it steps."""
+        """Return the distance of the capture point from the middle of the support, as a fraction of the distance to the
+        edge in the same direction. Beyond 1, the body falls unless it steps."""
         return measurement.support.relative_distance(self._capture(measurement), 1e-3 * self.body.height)
 
     def _balance_priority(self, measurement: Measurement) -> float:
@@ -434,7 +434,8 @@ class BalanceController:
         ]
 
     def turn_towards(self, measurement: Measurement, pose: np.ndarray) -> np.ndarray:
-        """Return the rotation vector (3,), world axes, from the measured best-fit rotation to that of ``pose``."""
+        """Return the rotation vector (3,), world axes, from the measured best-fit rotation to the best-fit
+        rotation of ``pose``."""
         target = kabsch_rotation(self.body.node_mass, self.arms, self.arms @ pose.T)
         return Rotation.from_matrix(target @ measurement.rotation.T).as_rotvec()
 

@@ -69,7 +69,7 @@ _NAMES = tuple(field.name for field in fields(Style))
 
 
 def read_style(text: str) -> Style:
-    """Parse a style such as ``heavy`` or ``anticipation=1.3 squash=1.2``; numbers override those of the preset.
+    """Parse a style such as ``heavy`` or ``anticipation=1.3 squash=1.2``; numbers override the values of the preset.
 
     Raises:
         UserError: for the first mistake.

@@ -67,8 +67,8 @@ class SupportPolygon:
         return inside if inside >= 0.0 else -float(np.linalg.norm(self.nearest(point) - point))
 
     def relative_distance(self, point: np.ndarray, min_distance: float) -> float:
-        """Return the distance of ``point`` (2,) from the middle, relative to the distance of the edge in the same
-        direction: 0 in the middle, 1 on the edge. The distance of an edge is assumed to be at least ``min_distance`` m.
+        """Return the distance of ``point`` (2,) from the middle, as a fraction of the distance to the edge in the same
+        direction: 0 in the middle, 1 on the edge. The distance to the edge is taken as at least ``min_distance``, m.
         """
         levels = self.normals @ self.middle
         return float(

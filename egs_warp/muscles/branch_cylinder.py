@@ -93,9 +93,9 @@ class BranchCylinder:
     def _place_stations(self, edge: float) -> np.ndarray:
         """Return the arc lengths of the fibres' vertices, m.
 
-        Fibres end inside the branch at a free end or at the ground, and slightly beyond it at a junction: the fibres of
-        a limb are anchored in the adjoining body but do not cross it. They have a vertex at the transition, so that
-        they do not leave the body on the inside of the bend.
+        The outermost vertex is inside the branch at a free end or at the ground, and slightly inside the adjoining body
+        at a junction: the fibres of a limb are anchored in the adjoining body but do not cross it. A vertex at the
+        transition keeps the fibres inside the body at a bend.
         """
         slim = np.flatnonzero(self.branch.own & (self.branch.radii <= 1.25 * np.median(self.branch.radii)))
         enters = float(self.arc[slim[0]]) if len(slim) else 0.0

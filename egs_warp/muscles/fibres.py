@@ -14,7 +14,7 @@ class FibreKind(Enum):
     LONGITUDINAL = "longitudinal"
     """Along the branch; shortens it, or bends it if only one side contracts."""
     RADIAL = "radial"
-    """Across the branch; thins and so lengthens it."""
+    """Across the branch; makes it thinner and thereby longer."""
     CIRCULAR = "circular"
     """Closed hoop around the branch; constricts it without an axial torque."""
     OBLIQUE_LEFT = "oblique_left"

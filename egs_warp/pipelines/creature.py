@@ -42,7 +42,8 @@ from egs_warp.segmentation.base_plane import find_base_plane, guess_up
 from egs_warp.short_repr import short_repr
 
 MIN_SAG = 0.004
-"""Fraction of the height: the sag of a body that its weight bends too much is halved, but not once it is below this."""
+"""Minimum sag, as a fraction of the height. The sag of a body that its weight bends too much is halved repeatedly, but
+not once it is below this."""
 _STRENGTH_POWER = 3
 """Exponent p: in soft parts, the strength of automatic muscles is proportional to the relative stiffness to the power
 p. With p = 1, the muscles stop the swing of a soft part before it returns."""
@@ -71,7 +72,7 @@ class CreatureOptions:
     metres_per_unit: float | None = None
     """Length of one unit of the capture, m; None makes the body 1 m tall."""
     sag: float = DEFAULT_SAG
-    """Fraction of its height by which the body sags under its weight, which defines its stiffness. The stiffness is
+    """Fraction of the body height by which the body sags under its weight; it defines the stiffness. The stiffness is
     increased if the weight would bend the body out of shape."""
     overlap: float = 0.0
     """Softness of parts that stick out (an ear, an arm, a tail; ``find_protrusions``), 0 to 0.5: the fraction of its
@@ -467,9 +468,10 @@ def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleS
 
 
 def _with_overlap(body: SoftBody, limbs: Limbs, overlap: float) -> SoftBody:
-    """Return ``body`` with soft parts that stick out (``CreatureOptions.overlap``).
+    """Return ``body`` with its protruding parts softened (``CreatureOptions.overlap``).
 
-    A body whose unloaded shape is the captured one (``_rest_state``) is not changed, because soft parts would droop.
+    A body whose unloaded shape is the captured one (``_rest_state``) is returned unchanged: its softened parts would
+    droop.
     """
     if overlap == 0.0 or _keeps_shape(body, limbs):
         return body

@@ -126,7 +126,8 @@ def merge_captures(captures: Sequence[Capture]) -> Capture:
 
 
 def _file_positions(capture: Capture) -> np.ndarray:
-    """Return the positions (n, 3) in the file: float64 with the offset of the capture, float32 if it has none."""
+    """Return the positions (n, 3) in the file's coordinates: means plus ``origin``, or the float32 means if there is no
+    origin."""
     means = capture.cloud.means.numpy()
     return means if capture.origin is None else means + capture.origin
 

@@ -177,7 +177,7 @@ def split_deformer(performance: SimulatedRun, *, in_scene: bool = False) -> Defo
     keys = simulation.frames[:: max(1, len(simulation.frames) // SPLIT_KEY_FRAMES)]
     embedding = embed_gaussians(cloud, creature.cage.mesh)
     if not in_scene and trajectory.ground_coefficients.size == 0:
-        # Hide haze of the captured ground, which would be visible below the creature in the air.
+        # Hide the haze of the captured ground, which would be visible below a jumping creature.
         cloud = hidden_below(cloud, GROUND, margin=_BELOW_GROUND * trajectory.height)
     split = split_for_motion(cloud, embedding, [trajectory.positions[step] for step in keys])
     return Deformer(split.cloud, split.embedding)

@@ -22,7 +22,7 @@ _MAX_SHARE = 1.0 / 3.0
 """Fraction of the capture's Gaussians above which there is a warning."""
 _REMEDY = "click with a minus on what does not belong to it, or mark it with masks"
 _MAX_GAP = 0.03
-"""Distance of the object to the ground above which its foot is missing, as a fraction of its size."""
+"""Distance of the object from the ground above which its foot is missing, as a fraction of its size."""
 _FLOOR_DISTANCE = 0.03
 """Distance to the plane within which flat Gaussians belong to the floor, as a fraction of the object's size."""
 _MAX_FLOOR_SHARE = 0.05

@@ -43,7 +43,7 @@ class TaskResult:
     value: Any
     """Return value of the task function; None if the task failed."""
     error: str | None
-    """Reason of a failure in one line; None if there is a value."""
+    """Reason for a failure in one line; None if there is a value."""
     attempts: int
     """Number of attempts: more than one if a worker was lost."""
 
@@ -57,7 +57,7 @@ class Event:
     kind: str
     """``progress``, ``done``, ``failed`` or ``lost``."""
     value: Any = None
-    """Values of a progress report, the result, or the reason of a failure in one line."""
+    """Values of a progress report, the result, or the reason for a failure in one line."""
 
 
 class WorkerPool(Protocol):

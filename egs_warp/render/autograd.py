@@ -65,9 +65,9 @@ def render_torch(
     current stream.
 
     Args:
-        rotation: (3, 3), replaces the camera's; its gradient is with respect to the nine entries, treated as
-            independent.
-        translation: (3,), replaces the camera's; given together with ``rotation`` or not at all.
+        rotation: (3, 3), replaces the rotation of the camera; its gradient is with respect to the nine entries,
+            treated as independent.
+        translation: (3,), replaces the translation of the camera; given together with ``rotation`` or not at all.
         screen: (n, 2), any values; receives the gradient with respect to the screen positions in pixels, which
             densification uses.
         background, antialiased, threads: as for ``render_gaussians``.

@@ -72,7 +72,7 @@ def studio_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> 
 
     Args:
         ground: the ground and its shadow.
-        cell: distance of the fine lines, world units; every fourth one is strong.
+        cell: spacing of the fine grid lines, world units; every fourth line is strong.
         shadow: False for no shadow.
     """
     camera, plane = ground.camera, ground.plane

@@ -21,20 +21,21 @@ CELLS = 64
 _MIN_OPACITY = 0.1
 """Minimum opacity of Gaussians that connect others. Fainter ones are assigned with their surroundings."""
 _MIN_DETACHED_HEIGHT = 0.1
-"""Fraction of the object's size. A part whose lowest point is higher does not stand on the ground."""
+"""Height of the lowest point, as a fraction of the object's size, above which a part does not stand on the ground."""
 _GAP = 2.0 / CELLS
-"""Fraction of the object's size. A detached part at most this far from the object belongs to it."""
+"""Maximum distance of a detached part that belongs to the object, as a fraction of the object's size."""
 _MAX_CHAIN = 4
 """Maximum number of detached parts in a chain, such as leaves that hang next to other detached leaves."""
 _HEAVY, _LIGHT = 0.05, 0.01
-"""Fractions of the object's opacity mass. A detached part heavier than the first is not a stray; a part lighter than
-the second cannot support another."""
+"""Two fractions of the object's opacity mass. A detached part heavier than the first is not a stray; a part lighter
+than the second cannot support another."""
 _MAX_DETACHED_GAP, _MIN_GAP_RATIO = 0.2, 2.0
 """Maximum distance from the object of a heavy detached part, such as a robot's hand, as a fraction of the object's
 size; and the minimum ratio between the part's distance from any other possible support and its distance from the
 object."""
 _NEAR_CLICK = 0.1
-"""Fraction of the object's size. A click that hits only faint Gaussians selects the part within this distance."""
+"""Maximum distance, as a fraction of the object's size, of the part that is selected by a click that hits only faint
+Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,9 @@ class SceneAbovePlane:
     heights: np.ndarray
     opacity: np.ndarray
     is_opaque: np.ndarray
-    """(n,) bool, opaque enough to connect."""
+    """(n,) bool, True for Gaussians that are opaque enough to connect parts."""
     is_level: np.ndarray
-    """(n,) bool, flat and parallel to the plane, as a floor's Gaussians are."""
+    """(n,) bool, True for Gaussians that are flat and parallel to the plane, as a floor's Gaussians are."""
 
     @classmethod
     def of(cls, cloud: GaussianCloud, plane: Plane | HeightField) -> SceneAbovePlane:

@@ -18,9 +18,10 @@ from egs_warp.segmentation.resting_directions import resting_directions
 _COLUMNS = 64
 """Columns across the longer side of the footprint."""
 _SEARCHED_SHARE = 0.15
-"""Fraction of the height, from the bottom, that is searched for the support."""
+"""Fraction of the object's height, from the bottom, in which the support is searched."""
 _BANDWIDTH = 0.01
-"""Fraction of the height: the width of one level. Column bottoms whose heights differ by less belong to one support."""
+"""Bandwidth of the density of column-bottom heights, as a fraction of the object's height. Bottoms within 1.5
+bandwidths of the peak belong to the support."""
 _MAX_GAUSSIANS = 300_000
 """Maximum number of Gaussians, sampled evenly, from which the up direction is estimated."""
 _MAX_MASS_BELOW = 0.015

@@ -40,9 +40,9 @@ class ExtentMeasure(enum.Enum):
     """Measure of a Gaussian's extent towards the plane."""
 
     AXIS_TIPS = "axis-tips"
-    """The farthest of its six axis tips, Eq. (20)."""
+    """The farthest of the six axis tips of the ellipsoid, Eq. (20)."""
     ELLIPSOID = "ellipsoid"
-    """The extent of its ellipsoid along the normal, gamma sqrt(N^T Sigma N), which is up to sqrt 3 times the extent of
+    """The extent of the ellipsoid along the normal, gamma sqrt(N^T Sigma N), which is up to sqrt 3 times the extent of
     the tips."""
 
 
@@ -72,10 +72,11 @@ class StraddlingOptions:
     """Maximum number of rounds, before training, in which each straddling Gaussian is split in three across the plane.
     Smaller Gaussians can lie closer to the plane without crossing it. The paper's method is 0."""
     fine_reach: float = 0.006
-    """Fraction of the object's height. Gaussians that extend no farther across the plane are not split further."""
+    """Extent across the plane, as a fraction of the object's height, up to which Gaussians are not split further."""
     max_growth: float = 0.25
-    """Maximum number of Gaussians that these splits add, as a fraction of the object's. Gaussians that extend farthest
-    across the plane are split first. Without this limit, each round doubles the number of straddling Gaussians."""
+    """Maximum number of Gaussians that these splits add, as a fraction of the number in the object. Those that extend
+    farthest across the plane are split first. Without this limit, each round doubles the number of straddling
+    Gaussians."""
     cut_rest: bool = True
     """Cut Gaussians that still straddle after training at the plane, as ``SPLIT`` does; the paper does not cut them."""
     seed: int = 0
@@ -353,7 +354,8 @@ def _cropped(views: Sequence[TrainingView], foot: GaussianCloud) -> list[Trainin
 
 
 def _in_pictures(cloud: GaussianCloud, cameras: Sequence[Camera]) -> np.ndarray:
-    """(n,) bool, True for Gaussians that reach the picture of one of the ``cameras``, even if others hide them."""
+    """Return (n,) bool, True for Gaussians that reach the picture of one of the ``cameras``, even if others hide
+    them."""
     reached, threads = np.zeros(cloud.count, bool), available_threads()
     for camera in cameras:
         projected = project(cloud, view_from_camera(camera), antialiased=cloud.antialiased, threads=threads)
@@ -362,7 +364,7 @@ def _in_pictures(cloud: GaussianCloud, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def straddling_loss(tensors: GaussianTensors, near: Any, normal: Any, offset: float, reach: ExtentMeasure) -> Any:
-    """L_seg of Eq. (21): the sum of eta_seg - |d0| over the Gaussians with indices ``near`` (m,) that straddle the
+    """Return L_seg (Eq. 21), the sum of eta_seg - |d0| over the Gaussians with indices ``near`` (m,) that straddle the
     plane.
 
     The result is a scalar tensor, scene units; ``normal`` (3,) and ``offset`` are the plane's.

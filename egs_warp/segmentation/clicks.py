@@ -17,7 +17,7 @@ from egs_warp.segmentation.votes import MaskedView, blending_votes
 _RADIUS = 0.004
 """Radius of a click as a fraction of the picture's longer side."""
 _MIN_WEIGHT_FRACTION = 0.1
-"""Fraction of the largest blending weight under a click; Gaussians below it are not hit."""
+"""Minimum blending weight of a Gaussian that a click hits, as a fraction of the largest weight under the click."""
 _SURFACE_FRACTION = 0.25
 """The clicked surface lies at the depth where the blending weight under the click, summed from the front, reaches this
 fraction."""
@@ -34,7 +34,8 @@ _ALIKE = 8
 _BY_COLOUR = 0.5
 """Maximum contribution of colours to the score, relative to the contribution of distances."""
 _ISLAND = 0.1
-"""Fraction of the retained part. A connected part that is smaller and has no click is dropped."""
+"""Minimum size of a connected part, as a fraction of the largest one. A part that is not larger and has no click is
+dropped."""
 
 
 @dataclass(frozen=True)
@@ -83,13 +84,13 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
 
 
 def _is_haze(cloud: GaussianCloud, rows: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """(m,) bool, True for the Gaussians ``rows`` (m,), indices of ``cloud``, that are wide and faint; ``depths`` (n,)
-    are the depths of all Gaussians."""
+    """Return (m,) bool, True for the Gaussians ``rows`` (m,), indices of ``cloud``, that are wide and faint; ``depths``
+    (n,) are the depths of all Gaussians."""
     return (cloud.breadths(rows) > _WIDE * depths[rows]) & (cloud.opacities()[rows] < _FAINT)
 
 
 def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> np.ndarray:
-    """(m,) bool, True for the indices ``nodes`` (m,) that clicks on the object (``inside``) or beside it hit."""
+    """Return (m,) bool, True for the indices ``nodes`` (m,) that clicks on the object (``inside``) or beside it hit."""
     hits = [click.hits for click in clicks if click.inside is inside]
     return np.isin(nodes, np.concatenate(hits)) if hits else np.zeros(len(nodes), bool)
 
@@ -97,7 +98,7 @@ def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> n
 def removed_by_clicks(
     cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], heights: np.ndarray, low: float
 ) -> np.ndarray:
-    """(m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that ``clicks`` remove.
+    """Return (m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that ``clicks`` remove.
 
     If all hits of a click beside the object are lower than ``low``, the click selects something on the ground, such as
     a shadow. Then it does not remove Gaussians that are higher than ``low`` and higher than twice its highest hit.
@@ -124,7 +125,7 @@ def removed_by_clicks(
 def cut_by_clicks(
     cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], *, required: np.ndarray | None = None
 ) -> np.ndarray:
-    """(m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that remain the object's after the
+    """Return (m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that remain the object's after the
     ``clicks``. ``required`` (m,) bool Gaussians remain unless a click beside the object hits them.
 
     The score of each Gaussian compares the two kinds of clicks by their distance along links between neighbours, which
@@ -155,8 +156,9 @@ def cut_by_clicks(
 
 
 def _by_colour(cloud: GaussianCloud, nodes: np.ndarray, score: np.ndarray) -> np.ndarray:
-    """(m,) -1 to 1, how much more common a Gaussian's colour is on the object's side than on the other. The measure is
-    the distance to its eighth nearest colour among the Gaussians of each side whose score is clear."""
+    """Return (m,) scores, -1 to 1: how much more common a Gaussian's colour is on the object's side than on the
+    other. The measure is the distance to the eighth nearest colour among the Gaussians of each side whose score is
+    clear."""
     colours = cloud.sh.numpy()[nodes, 0].astype(np.float64) * SH_BAND_0
     away = []
     for side in (score > _SURE, score < -_SURE):

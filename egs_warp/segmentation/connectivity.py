@@ -25,7 +25,7 @@ _MAX_GAUSSIANS = 200_000
 def connected_parts(
     cloud: GaussianCloud, chosen: np.ndarray, *, cell: float, plane: Plane | HeightField, above: float
 ) -> np.ndarray:
-    """(m,) int32 connected part of each of the ``chosen`` (m,) Gaussians.
+    """Return (m,) int32, the connected part of each of the ``chosen`` (m,) Gaussians.
 
     Gaussians are connected if points on their axes, the mean included, lie in the same cell of a grid.
 
@@ -38,7 +38,7 @@ def connected_parts(
     """
     points = cloud.means.numpy()[chosen].astype(np.float64)
     if len(points) > _FOURTH:
-        # The distance of the nearest neighbour is often zero, because training that splits Gaussians in place leaves
+        # The distance to the nearest neighbour is often zero, because training that splits Gaussians in place leaves
         # many of them at the same point.
         few = points[:: -(-len(points) // _MAX_GAUSSIANS)]
         cell = max(cell, 2.0 * float(np.median(KDTree(points).query(few, k=_FOURTH + 1)[0][:, _FOURTH])))
@@ -57,7 +57,8 @@ def connected_parts(
 
 
 def enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
-    """(n,) bool, True for ``points`` (n, k) in or within the closed shell of ``shell`` (m, k), on a grid of ``cell``.
+    """Return (n,) bool, True for ``points`` (n, k) in or within the closed shell of ``shell`` (m, k), on a grid of
+    ``cell``.
 
     Gaps of up to four cells are closed.
     """
@@ -79,15 +80,15 @@ def enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
 
 
 def close_to(points: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray:
-    """(n,) bool, True for ``points`` (n, k) within ``reach`` of one of ``others`` (m, k)."""
+    """Return (n,) bool, True for ``points`` (n, k) within ``reach`` of one of ``others`` (m, k)."""
     if len(others) == 0:
         return np.zeros(len(points), bool)
     return KDTree(others).query(points, distance_upper_bound=reach)[0] <= reach
 
 
 def nearer_to(points: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """(n,) bool, True for ``points`` (n, k) that are nearer to one of ``these`` (m, k) than to any of ``those`` (l,
-    k)."""
+    """Return (n,) bool, True for ``points`` (n, k) that are nearer to one of ``these`` (m, k) than to any of ``those``
+    (l, k)."""
     if len(these) == 0 or len(those) == 0:
         return np.full(len(points), len(those) == 0 < len(these))
     return KDTree(these).query(points)[0] < KDTree(those).query(points)[0]

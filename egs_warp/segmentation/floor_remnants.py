@@ -12,10 +12,10 @@ from egs_warp.segmentation.above_plane import SceneAbovePlane
 from egs_warp.segmentation.connectivity import close_to
 
 _MIN_REMNANT_WIDTH, _MAX_REMNANT_HEIGHT = 0.015, 0.1
-"""Fractions of the object's size: minimum standard deviation and maximum height of a Gaussian that may be a floor
-remnant."""
+"""Minimum standard deviation and maximum height of a Gaussian that may be a floor remnant, as fractions of the object's
+size."""
 _MAX_SCATTER = 0.02
-"""Fraction of the object's size. A floor is not assumed to scatter more than this."""
+"""Maximum scatter that is assumed for a floor, as a fraction of the object's size."""
 _NEIGHBOURS = 16
 """Number of Gaussians whose median colour is the local colour."""
 
@@ -35,8 +35,8 @@ def floor_scatter_height(scene: SceneAbovePlane, chosen: np.ndarray, size: float
 
 
 def floor_remnants(scene: SceneAbovePlane, chosen: np.ndarray, size: float) -> np.ndarray:
-    """(n,) bool, True for floor remnants: wide Gaussians of the object at its foot that have the floor's colour. On
-    uneven ground, Gaussians that lie flat are included."""
+    """Return (n,) bool, True for floor remnants: wide Gaussians of the object at its foot that have the floor's colour.
+    On uneven ground, Gaussians that lie flat are included."""
     low = scene.heights < _MAX_REMNANT_HEIGHT * size
     length = np.exp(scene.cloud.log_scales.numpy().max(axis=1))
     # Compare with the other Gaussians at the foot: in a coarse capture, all Gaussians of a stand are wide, and the

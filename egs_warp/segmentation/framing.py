@@ -57,7 +57,7 @@ def with_framing(cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camer
 
 
 def _in_frame(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """(n,) bool, True for ``points`` (n, 3) inside the camera's picture, even if something hides them."""
+    """Return (n,) bool, True for ``points`` (n, 3) inside the camera's picture, even if something hides them."""
     across, down, depth = camera.rotation @ points.T + camera.translation[:, None]
     ahead = depth > camera.near
     depth = np.where(ahead, depth, 1.0)

@@ -96,13 +96,13 @@ class SplatGraph:
         return SplatGraph(int(chosen.sum()), first, second, self.length[inner], self.strength[inner])
 
     def strength_to(self, chosen: np.ndarray) -> np.ndarray:
-        """(n,) strength of the links of each Gaussian to the ``chosen`` (n,) bool ones."""
+        """Return (n,), the strength of the links of each Gaussian to the ``chosen`` (n,) bool ones."""
         forward = np.bincount(self.first, self.strength * chosen[self.second], self.count)
         return forward + np.bincount(self.second, self.strength * chosen[self.first], self.count)
 
     def distances(self, seeds: np.ndarray) -> np.ndarray:
-        """(n,) length of the shortest path along the links from each Gaussian to one of the ``seeds`` (k,); infinite if
-        there is none."""
+        """Return (n,), the length of the shortest path along the links from each Gaussian to one of the ``seeds`` (k,);
+        infinite if there is none."""
         # Links of zero length would be treated as missing.
         links = coo_array((np.maximum(self.length, 1e-9), (self.first, self.second)), shape=(self.count,) * 2)
         return dijkstra(links.tocsr(), directed=False, indices=seeds, min_only=True)
@@ -138,7 +138,8 @@ class SplatGraph:
         return inside[: self.count]
 
     def parts(self, inside: np.ndarray) -> np.ndarray:
-        """(n,) int32, connected part of each Gaussian; links across a cut ``inside`` (n,) bool are ignored."""
+        """Return (n,) int32, the connected part of each Gaussian; links across a cut ``inside`` (n,) bool are
+        ignored."""
         whole = inside[self.first] == inside[self.second]
         links = coo_array(
             (np.ones(int(whole.sum()), np.int8), (self.first[whole], self.second[whole])), shape=(self.count,) * 2
@@ -149,7 +150,7 @@ class SplatGraph:
 def _differences(
     points: np.ndarray, colours: np.ndarray, first: np.ndarray, second: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each link, the distance of its ends divided by the median, and the difference of their colours
+    """Return, for each link, the distance between its ends divided by the median, and the difference of their colours
     divided by the mean."""
     away = np.linalg.norm(points[first] - points[second], axis=1)
     apart = np.linalg.norm(colours[first] - colours[second], axis=1)

@@ -20,40 +20,42 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.seen_surface import SeenSurface
 
 ROUGH = 0.01
-"""Fraction of the object's height. Ground is uneven if the standard deviation from its plane exceeds this. Contact
-allows a penetration of half as much."""
+"""Standard deviation of the ground from its plane, as a fraction of the object's height, above which ground is uneven.
+Contact allows a penetration of half as much."""
 REACH = 2.5
 """Half the side of the measured square about the object's centre, as a fraction of the object's size."""
 _SPACING = 0.025
-"""Fraction of the object's size: distance between nodes."""
+"""Distance between nodes, as a fraction of the object's size."""
 _BAND = 0.25
-"""Fraction of the object's size. Points farther from the plane are not ground."""
+"""Maximum distance of points of the ground from the plane, as a fraction of the object's size."""
 _MIN_VIEWS = 3
 """Minimum number of views that must show a node."""
 _MAX_VIEW_DIFFERENCE = 0.02
-"""Fraction of the object's size. A node is unknown if the standard deviation of its height between views is larger."""
+"""Standard deviation of a node's height between views, as a fraction of the object's size, above which the node is
+unknown."""
 _MIN_SIGNAL_TO_NOISE = 3.0
 """Ground is uneven if it is rougher than this many times the difference between views, because reflections also cause
 bumps."""
 _SMOOTHING = 0.7
 """Standard deviation, in nodes, of the blur that removes the noise of single nodes."""
 _ROUGHNESS_RADIUS = 1.0
-"""Fraction of the object's size: radius about the object in which roughness is measured."""
+"""Radius about the object in which roughness is measured, as a fraction of the object's size."""
 _VIEWS = 16
 _SIDE = 400
 """Longer side of a view, pixels."""
 _ELEVATIONS = (40.0, 58.0, 75.0)
 """Elevations of the views in degrees, if the capture's cameras are unknown."""
 _DEPTH_TOLERANCE = 0.005
-"""Fraction of the depth. A pixel shows ground if its depths with and without the object differ by less than this."""
+"""Difference between the depths with and without the object, as a fraction of the depth, below which a pixel shows
+ground."""
 _MAX_SLOPE = 1.2
-"""Rise over run between nodes. Steeper ground is an edge, and the plane continues beyond it."""
+"""Maximum slope (rise over run) between nodes. Steeper ground is an edge, and the plane continues beyond it."""
 _MAX_GAP = 0.05
-"""Fraction of the object's size. An object farther above the ground does not stand on it."""
+"""Maximum gap between the ground and an object that stands on it, as a fraction of the object's size."""
 _SOLID = 0.3
 """Minimum opacity of Gaussians that can touch the ground."""
 _PATCH = 0.05
-"""Fraction of the largest connected patch of ground. Smaller patches are specks."""
+"""Minimum size of a connected patch of ground, as a fraction of the largest one. Smaller patches are specks."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,8 @@ class MeasuredGround:
     """Heights of the ground about an object, and their quality."""
 
     field: HeightField
-    """Scene units. Unseen ground, including the ground under the object, is the harmonic continuation."""
+    """Heights of the ground, scene units. Unseen ground, including the ground under the object, is the harmonic
+    continuation."""
     known: np.ndarray
     """(rows, columns) bool, nodes that were seen."""
     roughness: float
@@ -70,7 +73,8 @@ class MeasuredGround:
     """Median, over the nodes next to the object, of the standard deviation between views, scene units."""
 
     def is_flat(self, height: float) -> bool:
-        """True if an object of ``height`` (scene units) may be placed on the plane instead."""
+        """True if the ground is so flat that an object of ``height`` (scene units) may be placed on the plane instead
+        of the height field."""
         return self.roughness < max(ROUGH * height, _MIN_SIGNAL_TO_NOISE * self.noise)
 
     def touched_by(self, object_cloud: GaussianCloud, size: float) -> HeightField:
@@ -164,8 +168,8 @@ def measure_ground(
 
 
 def _seen_points(cloud: GaussianCloud, bare: GaussianCloud, camera: Camera, plane: Plane) -> np.ndarray:
-    """(n, 3) points of the ground that ``camera`` sees both in ``cloud`` and in ``bare``, the capture without the
-    object. Points that appear only in ``bare`` are seen through the hole that the object leaves, and lie below the
+    """Return (n, 3) points of the ground that ``camera`` sees both in ``cloud`` and in ``bare``, the capture without
+    the object. Points that appear only in ``bare`` are seen through the hole that the object leaves, and lie below the
     ground. The heights of the returned points over ``plane`` are computed from the splats (``SeenSurface``)."""
     whole, left = SeenSurface.of(cloud, camera), SeenSurface.of(bare, camera)
     same = np.abs(whole.depth - left.depth) < _DEPTH_TOLERANCE * left.depth
@@ -173,8 +177,8 @@ def _seen_points(cloud: GaussianCloud, bare: GaussianCloud, camera: Camera, plan
 
 
 def _without_edges(heights: np.ndarray, known: np.ndarray, spacing: float) -> np.ndarray:
-    """(rows, columns) bool, nodes whose neighbours are not much higher or lower. The rim of the ``known`` nodes is
-    excluded, as it is ragged."""
+    """Return (rows, columns) bool, the nodes whose neighbours are not much higher or lower. The rim of the ``known``
+    nodes is excluded, as it is ragged."""
     low = ndimage.minimum_filter(np.where(known, heights, np.inf), 3)
     high = ndimage.maximum_filter(np.where(known, heights, -np.inf), 3)
     rim = np.logical_not(ndimage.binary_erosion(ndimage.binary_closing(known, iterations=2), iterations=1))

@@ -41,7 +41,7 @@ _MIN_PART = 8
 _MAX_EXTENT = 0.9
 """Maximum extent along the ground of the part that one click selects, as a fraction of the capture's diagonal."""
 _FOOT = 0.015
-"""Fraction of the object's size. Within this height above the ground, Gaussians link nothing."""
+"""Height above the ground, as a fraction of the object's size, below which Gaussians have no links."""
 _FIRST_FOOT = 0.1
 """Foot height before the object's size is known, as a fraction of the lowest click's height above the ground."""
 _LEVEL_FOOT = 3.0
@@ -53,7 +53,8 @@ _GROUND_WEIGHT = 0.5
 _MAX_REMOVED = 2.0 / 3.0
 """Maximum share of a proposal that one click beside the object removes if no click is on the object."""
 _UNDER = 0.1
-"""Fraction of the object's size. The outline of the object's parts below this height is the outline of its foot."""
+"""Height, as a fraction of the object's size, below which the outline of the object's parts is the outline of its
+foot."""
 
 
 @dataclass(frozen=True)
@@ -212,7 +213,7 @@ def _chosen(
 
 
 def _within(inside: np.ndarray, seeds: Sequence[np.ndarray]) -> np.ndarray:
-    """(k,) int, numbers of ``seeds`` among the ``inside`` (m,) bool nodes; seeds outside are left out."""
+    """Return (k,) int, numbers of ``seeds`` among the ``inside`` (m,) bool nodes; seeds outside are left out."""
     number = np.cumsum(inside) - 1
     joined = np.concatenate(seeds) if len(seeds) else np.zeros(0, int)
     return np.unique(number[joined[inside[joined]]])
@@ -226,7 +227,7 @@ def _part_around(
     extent: float,
     max_nodes: int | None = None,
 ) -> np.ndarray:
-    """(m,) bool, the part around ``seeds`` (k,) with the weakest boundary for its size.
+    """Return (m,) bool, the part around ``seeds`` (k,) with the weakest boundary for its size.
 
     The candidates are the sets of nodes up to each distance along the links (sweep cut; Spielman and Teng 2004). The
     measure is the strength of the links that leave a set, including the links ``at_ground`` (m,) of its nodes to the
@@ -255,8 +256,8 @@ def _part_around(
 
 
 def _without(links: SplatGraph, seeds: np.ndarray, removed: np.ndarray) -> np.ndarray:
-    """(m,) bool, the nodes that a minimum cut assigns to ``seeds`` (k,) rather than to ``removed`` (l,); neither may be
-    empty.
+    """Return (m,) bool, the nodes that a minimum cut assigns to ``seeds`` (k,) rather than to ``removed`` (l,); neither
+    may be empty.
 
     The score of a node compares its distances along the links from both. Parts without links to a removed node remain.
     """
@@ -272,8 +273,8 @@ def _without(links: SplatGraph, seeds: np.ndarray, removed: np.ndarray) -> np.nd
 
 
 def _gaps(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph) -> np.ndarray:
-    """(m,) length of the empty part of each link between the Gaussians ``nodes`` (k,), divided by the median length of
-    all links; negative if the two Gaussians overlap."""
+    """Return (m,), the length of the empty part of each link between the Gaussians ``nodes`` (k,), divided by the
+    median length of all links; negative if the two Gaussians overlap."""
     points = cloud.means.numpy()[nodes].astype(np.float64)
     arms = points[links.second] - points[links.first]
     lengths = np.linalg.norm(arms, axis=1)
@@ -290,8 +291,8 @@ def _gaps(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph) -> np.ndar
 
 
 def _clusters(points: np.ndarray, colours: np.ndarray) -> np.ndarray:
-    """(n,) int32, clusters of at most ``_CLUSTER`` Gaussians each, made by repeated halving along the longest side; the
-    last halvings also separate colours."""
+    """Return (n,) int32, clusters of at most ``_CLUSTER`` Gaussians each, made by repeated halving along the longest
+    side; the last halvings also separate colours."""
     count = len(points)
     levels = max(0, int(np.ceil(np.log2(max(count, 1) / _CLUSTER))))
     values = np.concatenate([points, colours], axis=1)

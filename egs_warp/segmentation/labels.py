@@ -40,7 +40,7 @@ def labels_of_votes(votes: Votes, *, background_bias: float = 0.0) -> tuple[np.n
 def smoothed_labels(
     cloud: GaussianCloud, votes: Votes, nodes: np.ndarray, clicks: Sequence[Click] = (), *, views: int = 1
 ) -> np.ndarray:
-    """(m,) bool labels of the ``nodes`` (m,), indices of ``cloud``, by a minimum cut.
+    """Return (m,) bool, the labels of the ``nodes`` (m,), indices of ``cloud``, by a minimum cut.
 
     The score of a node is its vote, or 0 if no view shows it; nodes that ``clicks`` hit have fixed labels. With several
     ``views`` the confidence grows with the square root of their number, because errors of independently drawn masks

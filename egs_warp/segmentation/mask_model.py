@@ -35,7 +35,7 @@ class ClickModel(Protocol):
     """A model that segments an object from clicks."""
 
     def mask(self, picture: np.ndarray, points: np.ndarray, inside: np.ndarray) -> np.ndarray:
-        """(H, W) bool mask of the object in ``picture`` (H, W, 3) float32, 0 to 1.
+        """Return (H, W) bool, the mask of the object in ``picture`` (H, W, 3) float32, 0 to 1.
 
         Args:
             picture: (H, W, 3) float32, 0 to 1.
@@ -114,7 +114,7 @@ class SalientModel:
         )
 
     def mask(self, picture: np.ndarray) -> np.ndarray:
-        """(H, W) bool, the salient region of ``picture`` (H, W, 3) float32, 0 to 1."""
+        """Return (H, W) bool, the salient region of ``picture`` (H, W, 3) float32, 0 to 1."""
         rows, columns = picture.shape[:2]
         small = cv2.resize(picture.astype(np.float32), (_SALIENT_SIDE, _SALIENT_SIDE), interpolation=cv2.INTER_AREA)
         small = (small / max(float(small.max()), 1e-6) - _MEAN) / _DEVIATION

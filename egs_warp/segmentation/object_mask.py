@@ -23,24 +23,25 @@ _NOTHING_ABOVE = (
     "object: no part of it lies above the plane; mark it with other masks, a box or a point, or give its plane"
 )
 _MAX_FLOATER_MASS = 0.01
-"""Fraction of the object's opacity mass. A smaller connected part is a floater."""
+"""Opacity mass below which a connected part is a floater, as a fraction of the mass of the object's main part."""
 _MIN_PART_MASS = 0.05
-"""Fraction of the mass of the largest connected part. Another part claimed by masks belongs to the object if it has
-more."""
+"""Minimum opacity mass claimed by masks in another part that belongs to the object, as a fraction of the mass claimed
+in the main part."""
 _HOLLOW = 0.35
-"""Fraction of the object's size: maximum distance of a point in the middle of a hollow body from its surface."""
+"""Maximum distance of a point in the middle of a hollow body from its surface, as a fraction of the object's size."""
 TOUCHING = 0.1
-"""Fraction of the object's size. An object higher above a plane does not stand on it."""
+"""Maximum height above a plane of an object that stands on it, as a fraction of the object's size."""
 FOOTPRINT_HEIGHT = 0.08
-"""Fraction of the object's size. The parts of the object below this height hide the floor."""
+"""Height below which the parts of the object hide the floor, as a fraction of the object's size."""
 _HALO = 0.1
-"""Fraction of the object's size. Floaters within this distance of the object are its halo."""
+"""Maximum distance from the object of floaters that form its halo, as a fraction of the object's size."""
 _HALVINGS = 6
 """Maximum number of halvings of the first guess of an object's size, about a point in a large room."""
 _MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.3, 4.0
-"""Fractions of a guessed size. An object much smaller or larger than the guess does not match it."""
+"""Minimum and maximum size of an object that matches a guessed size, as fractions of that size."""
 _HANGING = 0.5
-"""Fraction of the object's size. A part that is entirely higher above the plane does not stand on it."""
+"""Maximum height above the plane of the lowest point of an object whose hollow shell the floor closes, as a fraction of
+the object's size."""
 _MIN_HAZE_WIDTH, _MIN_HAZE_WIDTH_RATIO, _MAX_HAZE_OPACITY = 0.05, 4.0, 0.3
 """Minimum width of haze, as a fraction of the object's size and as a multiple of the median width of the object's
 Gaussians, and its maximum opacity. Gaussians wider and fainter than this would move with the object as a halo."""
@@ -49,7 +50,7 @@ _MAX_HAZE_GAP, _MAX_COLOUR_DIFFERENCE, _NEIGHBOURS = 0.05, 0.15, 16
 1; and number of nearest Gaussians of the object with which the colour is compared. Haze within both limits is the
 object's own."""
 _FOOT = 0.015
-"""Fraction of the object's size. Within this height above the plane, floor and object cannot be separated by
+"""Height above the plane, as a fraction of the object's size, below which floor and object cannot be separated by
 connectivity."""
 
 
@@ -63,8 +64,8 @@ def segment(
 ) -> Segmentation:
     """Find the object that ``spec`` describes and that stands on ``plane`` or on uneven ground.
 
-    Around a point, the object's size is first guessed as half of the capture's. If nothing of that size stands on the
-    plane, which is common in a room, the guess is halved repeatedly.
+    Around a point, the object's size is first guessed as half of the capture's size. If nothing of that size stands on
+    the plane, which is common in a room, the guess is halved repeatedly.
 
     Args:
         cloud: the capture.
@@ -188,15 +189,15 @@ def _of_size(
 
 
 def _haze_indices(scene: SceneAbovePlane, object_indices: np.ndarray, size: float) -> np.ndarray:
-    """(k,) int, the haze among the Gaussians ``object_indices`` (m,)."""
+    """Return (k,) int, the indices of the haze among the Gaussians ``object_indices`` (m,)."""
     across = scene.cloud.breadths(object_indices)
     wide = across > max(_MIN_HAZE_WIDTH * size, _MIN_HAZE_WIDTH_RATIO * float(np.median(across)))
     return object_indices[wide & (scene.opacity[object_indices] < _MAX_HAZE_OPACITY)]
 
 
 def _is_own_haze(scene: SceneAbovePlane, haze: np.ndarray, object_mask: np.ndarray, size: float) -> np.ndarray:
-    """(k,) bool, True for the Gaussians ``haze`` (k,) that are inside the object ``object_mask`` (n,) bool, or near it
-    with similar colours.
+    """Return (k,) bool, True for the Gaussians ``haze`` (k,) that are inside the object ``object_mask`` (n,) bool, or
+    near it with similar colours.
 
     In the background, this haze would remain as a ghost of the object.
     """
@@ -276,13 +277,15 @@ def _body(
         shell = np.concatenate([shell, shell - 2.0 * (heights[:, None] - foot) * scene.plane.normal])
     chosen |= enclosed(scene.means, shell, 2.0 * size / CELLS) & (scene.heights > foot)
     chosen |= lying & scene.is_under(chosen, 0.1 * size, size)
-    # Gaussians that were added by position are removed again if a removed Gaussian is nearer than one of the object's.
+    # Gaussians that were added by position are removed again if a removed Gaussian is nearer than any
+    # Gaussian of the object.
     removed |= nearer_to(scene.means, scene.means[removed], scene.means[chosen & ~removed])
     return chosen & ~removed, small_parts, removed
 
 
 def _first_size(scene: SceneAbovePlane, claimed_by_user: np.ndarray, spec: ObjectSpec) -> float:
-    """Return the first guess of the object's size, scene units: half of the capture's if only a point is known."""
+    """Return the first guess of the object's size, scene units: half of the capture's size if only a
+    point is known."""
     if spec.box is not None:
         return float(np.linalg.norm(spec.box.high - spec.box.low))
     standing = claimed_by_user & scene.is_opaque & (scene.heights > 0.0)
@@ -297,7 +300,7 @@ def _diagonal(points: np.ndarray) -> float:
 
 
 def _within(points: np.ndarray, chosen: np.ndarray, margin: float) -> np.ndarray:
-    """(n,) bool, True for ``points`` (n, 3) in the box of nearly all ``chosen`` (n,) bool ones, enlarged by
+    """Return (n,) bool, True for ``points`` (n, 3) in the box of nearly all ``chosen`` (n,) bool ones, enlarged by
     ``margin``."""
     if not chosen.any():
         return chosen

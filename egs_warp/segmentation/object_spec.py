@@ -22,7 +22,7 @@ class Box:
     """(3,) corner with the highest coordinates, scene units."""
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """(n,) bool, True for points (n, 3) in the box."""
+        """Return (n,) bool, True for points (n, 3) in the box."""
         return np.all((points >= self.low) & (points <= self.high), axis=1)
 
 

@@ -21,7 +21,7 @@ _TUKEY = 2.0
 outliers, but an object is close to the plane at its foot: with 3.0, the planes of some of 100 scenes are tilted by a
 degree."""
 _MIN_NOISE = 1e-3
-"""Fraction of the depth. Points nearer to the plane than this are on it. If a few wide splats form a floor, a plane
+"""Minimum scale of the residuals in the weights, as a fraction of the depth. If a few wide splats form a floor, a plane
 through three of them has zero error in half of the pixels, and without this minimum all other pixels would have zero
 weight."""
 _MIN_SINE = 0.02
@@ -54,7 +54,7 @@ class PlaneFit:
 
 
 def plane_depth(plane: Plane, camera: Camera) -> np.ndarray:
-    """(H, W) z-depth D_p of the plane along each pixel's ray, Eq. (18); 0 where the ray does not meet it."""
+    """Return (H, W), the z-depth D_p of the plane along each pixel's ray, Eq. (18); 0 where the ray misses it."""
     slope = camera_rays(camera) @ plane.normal
     height = float(plane.heights(camera.centre))
     depth = -height / np.where(slope == 0.0, np.inf, slope)
@@ -66,7 +66,8 @@ def fit_plane(views: Sequence[PlaneView], *, start: Plane | None = None, seed: i
 
     The residual of a pixel is its relative error in depth, D_g / D_p - 1, which for one view is linear in m = -N / (N.o
     + d). Up to 40 % of the pixels may be outliers. The initial plane is found by random sampling or, if ``start`` is
-    given (in the paper, the view direction with d = 0), by reweighted least squares on inverse depth from there.
+    given (in the paper, the view direction with d = 0), by reweighted least squares on inverse depth, beginning
+    at ``start``.
 
     Raises ``UserError`` for masks of the wrong size or without depth, and if no plane explains the pixels.
     """
@@ -105,7 +106,8 @@ class _Pixels:
         return self.origins + self.depth[:, None] * self.rays
 
     def residuals(self, plane: Plane) -> np.ndarray:
-        """(p,) D_g / D_p - 1 = -(height of the rendered point) / (height of the camera), heights over ``plane``."""
+        """Return (p,), the relative errors D_g / D_p - 1 = -(height of the rendered point) / (height of the camera),
+        with heights over ``plane``."""
         camera = self.origins @ plane.normal + plane.offset
         least = 1e-9 * np.abs(self.depth)
         camera = np.where(np.abs(camera) < least, least, camera)

@@ -21,14 +21,14 @@ _TRIALS = 1500
 _SAMPLE = 4000
 _MIN_OPACITY = 0.3
 _BAND = 0.03
-"""Fraction of the search radius. Points nearer to the plane belong to it. With 0.06, planes fitted to single views of a
-real table differed by 0.8 degrees; with 0.03, by 0.3 degrees."""
+"""Maximum distance of points that belong to a plane, as a fraction of the search radius. With 0.06, planes fitted to
+single views of a real table differed by 0.8 degrees; with 0.03, by 0.3 degrees."""
 _VIEWS = 8
 """Maximum number of pictures to which a plane is fitted."""
 _MIN_SUPPORT = 0.005
-"""Fraction of the visible level surface. A plane with less support is accidental."""
+"""Minimum support of a plane, as a fraction of the visible level surface. A plane with less support is accidental."""
 _CELL = 0.1
-"""Fraction of the object's size: side of the cells on which a plane must be one patch."""
+"""Side of the cells on which a plane must be one patch, as a fraction of the object's size."""
 _COVERED = 0.3
 """Fraction of a cell's area that must be covered for the cell to belong to the patch."""
 
@@ -224,12 +224,12 @@ def _masked(
 
 
 def near_plane(cloud: GaussianCloud, plane: Plane, thickness: float) -> np.ndarray:
-    """(n,) bool, True for Gaussians whose mean is within ``thickness`` (scene units) of the plane."""
+    """Return (n,) bool, True for Gaussians whose mean is within ``thickness`` (scene units) of the plane."""
     return np.abs(plane.heights(cloud.means.numpy())) < thickness
 
 
 def lies_along(cloud: GaussianCloud, plane: Plane | HeightField) -> np.ndarray:
-    """(n,) bool, True for flat Gaussians parallel to ``plane``, like those of a floor, at any height."""
+    """Return (n,) bool, True for flat Gaussians parallel to ``plane``, like those of a floor, at any height."""
     scales = cloud.log_scales.numpy()
     turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
     thin = np.take_along_axis(turns, scales.argmin(axis=1)[:, None, None], axis=2)[:, :, 0]
@@ -254,7 +254,7 @@ def further_planes(cloud: GaussianCloud, plane: Plane, size: float, count: int) 
 
 
 def _is_one_patch(level: GaussianCloud, plane: Plane, cell: float) -> bool:
-    """True if one patch of well covered cells (scene units) contains most of the surface near ``plane``."""
+    """Return True if one patch of well covered cells (scene units) contains most of the surface near ``plane``."""
     chosen = near_plane(level, plane, 0.5 * cell)
     if not chosen.any():
         return False

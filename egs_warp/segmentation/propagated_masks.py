@@ -22,7 +22,7 @@ from egs_warp.segmentation.votes import MaskedView, votes_of_masks
 _SIDE = 800
 """Longer side of the segmented pictures, pixels."""
 _MIN_VISIBLE_FRACTION = 0.002
-"""Fraction of a picture. If less of the object is visible, the picture is not segmented."""
+"""Minimum visible part of the object, as a fraction of the picture, for a picture to be segmented."""
 _PROMPTS = 3
 """Number of points inside the propagated mask that prompt the network."""
 _MIN_COVERED_FRACTION, _MAX_AREA_RATIO = 0.5, 3.0
@@ -32,7 +32,7 @@ _MAX_SALIENT_FRACTION, _MIN_OVERLAP = 0.6, 0.5
 """Maximum fraction of a picture that a salient region may cover; and the minimum overlap (intersection over union) of a
 mask with the consensus of all."""
 _HIDDEN = 0.03
-"""Fraction of the depth. A click that is farther than this behind the visible surface is hidden in that view."""
+"""Distance behind the visible surface, as a fraction of the depth, beyond which a click is hidden in that view."""
 
 
 def masks_of_clicks(
@@ -133,7 +133,7 @@ def _propagate_mask(
 
 
 def _size(mask: np.ndarray, camera: Camera, middle: np.ndarray) -> float:
-    """Return the area of ``mask`` (H, W) at the distance of ``middle`` (3,), scene units squared."""
+    """Return the area of ``mask`` (H, W) at the distance of ``middle`` (3,) from the camera, scene units squared."""
     return float(mask.sum()) * (float(np.linalg.norm(camera.centre - middle)) / camera.fx) ** 2
 
 
@@ -162,8 +162,8 @@ def _well_apart(chosen_before: Sequence[Camera], cameras: Sequence[Camera], coun
 
 
 def _innermost(mask: np.ndarray, count: int) -> np.ndarray:
-    """(k, 2) pixels, at most ``count``: the innermost point of ``mask`` (H, W), then repeatedly the innermost of the
-    remaining points. Points within twice the depth of an earlier one are excluded."""
+    """Return (k, 2) pixels, at most ``count``: the innermost point of ``mask`` (H, W), then repeatedly the innermost of
+    the remaining points. Points within twice the depth of an earlier one are excluded."""
     places = []
     depth = depth_inside(np.pad(mask, 1))[1:-1, 1:-1]
     rows, columns = np.indices(mask.shape)

@@ -22,8 +22,8 @@ _MAX_TURN = np.cos(np.radians(10.0))
 
 
 def resting_directions(points: np.ndarray, *, at_most: int) -> np.ndarray:
-    """(m, 3) unit up directions, at most ``at_most``, in which ``points`` (n, 3) can rest, in descending order of the
-    area of their facets.
+    """Return (m, 3) unit up directions, at most ``at_most``, in which ``points`` (n, 3) can rest, in descending order
+    of the area of their facets.
 
     Empty if the points have no volume.
     """

@@ -23,8 +23,8 @@ _BELOW = 0.25
 _STRAYS = 0.005
 """Fraction of the Gaussians that may lie below the plane: mirror images in a glossy table, and strays."""
 _FRINGE, _FOOT, _HAZE = 0.1, 0.05, 0.1
-"""Fractions of the object's size: maximum distance from it, height above its plane and width of the remnants at its
-foot."""
+"""Maximum distance from the object, maximum height above its plane, and maximum width of the remnants at the object's
+foot, as fractions of the object's size."""
 _POINTS = 4000
 """Maximum number of points used, spread evenly."""
 _ROUNDS, _GRID_SIZE = 4, 15

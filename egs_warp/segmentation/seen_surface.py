@@ -43,8 +43,8 @@ class SeenSurface:
         return cls(camera, depth, middles, (image.alpha.numpy() > _OPAQUE) & (depth > 0.0))
 
     def depth_over(self, plane: Plane) -> np.ndarray:
-        """(H, W) z-depth at which each pixel's ray reaches the height over ``plane`` of the surface seen in that pixel;
-        0 where the ray does not reach it.
+        """Return (H, W), the z-depth at which each pixel's ray reaches the height over ``plane`` of the surface seen in
+        that pixel; 0 where the ray does not reach it.
 
         ``plane`` must only be roughly parallel to the surface: the error is its tilt times the width of a splat.
         """
@@ -54,7 +54,7 @@ class SeenSurface:
         return np.where(down, fall / np.where(down, -slope, 1.0), 0.0)
 
     def points(self, plane: Plane, chosen: np.ndarray) -> np.ndarray:
-        """(n, 3) points of the ``chosen`` (H, W) bool pixels at the depths of ``depth_over``, where these are
+        """Return (n, 3) points of the ``chosen`` (H, W) bool pixels at the depths of ``depth_over``, where these are
         positive."""
         depth = self.depth_over(plane)
         valid = chosen & (depth > 0.0)

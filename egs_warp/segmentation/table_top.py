@@ -30,7 +30,7 @@ the outline is excluded."""
 _COVERED = 0.3
 """Fraction of a cell that must be covered by the surface."""
 _NEAR = 0.03
-"""Fraction of the object's size. Gaussians farther from the plane do not belong to it."""
+"""Maximum distance of Gaussians that belong to a plane, as a fraction of the object's size."""
 
 
 def planes_below(cloud: GaussianCloud, up: np.ndarray, point: np.ndarray) -> list[Plane]:

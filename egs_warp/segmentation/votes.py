@@ -44,12 +44,12 @@ class Votes:
     """(n,) float64 blending weight without occlusion."""
 
     def share_inside(self) -> np.ndarray:
-        """(n,) 0 to 1, share of the weight inside the masks; 0.5 for Gaussians that no view shows."""
+        """Return (n,), 0 to 1, the share of the weight inside the masks; 0.5 for Gaussians that no view shows."""
         total = self.inside + self.outside
         return np.where(total > 0.0, self.inside / np.maximum(total, 1e-30), 0.5)
 
     def share_seen(self) -> np.ndarray:
-        """(n,) 0 to 1, visible share of each Gaussian."""
+        """Return (n,), 0 to 1, the visible share of each Gaussian."""
         return np.minimum((self.inside + self.outside) / np.maximum(self.unhidden, 1e-30), 1.0)
 
 

@@ -29,7 +29,7 @@ class ExposureModel:
         self._identity = torch.eye(3, 4, device=device)
 
     def tensor_for(self, number: int) -> torch.Tensor:
-        """(3, 4) colour map of view ``number``, a leaf tensor; ``step`` uses its gradient."""
+        """Return (3, 4), the colour map of view ``number``, a leaf tensor; ``step`` uses its gradient."""
         self._leaf = leaf = (self._identity + self._offsets[number]).requires_grad_()
         return leaf
 

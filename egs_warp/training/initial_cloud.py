@@ -24,7 +24,7 @@ _SIZE_OF_POINT, _OPACITY_OF_POINT = 1.0, 0.1
 
 
 def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
-    """(3,) point nearest to the optical axes of all ``cameras``, in the least-squares sense."""
+    """Return (3,), the point nearest to the optical axes of all ``cameras``, in the least-squares sense."""
     centres = np.array([camera.centre for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]

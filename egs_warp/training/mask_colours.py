@@ -22,7 +22,7 @@ _MAX_MASKS = 24
 _SIDE = 64
 """Longer side to which masks are reduced, pixels."""
 _MIN_RIM = 0.85
-"""Minimum mean fraction of white pixels along the border at which the white region is taken for the surroundings."""
+"""Minimum mean fraction of white pixels along the border at which the white region is treated as the surroundings."""
 _AREA = (0.01, 0.6)
 """Range of the mean fraction of black pixels in masks that show the object in black."""
 _POINTS = 40_000
@@ -73,7 +73,7 @@ class _MaskView:
 
     @classmethod
     def of(cls, one: PosedImage) -> _MaskView | None:
-        """Read the mask of ``one``; None if it is not readable or not of the camera's shape."""
+        """Read the mask of ``one``; return None if it is unreadable or has the wrong orientation."""
         assert one.mask is not None
         try:
             limit = MAX_MASK_RATIO * one.camera.width * one.camera.height

@@ -52,7 +52,8 @@ class OutlierViews:
 
 
 def is_outlier(losses: np.ndarray) -> np.ndarray:
-    """(n,) bool, True for ``losses`` (n,) that are far above the others; all False if there are fewer than eight."""
+    """Return (n,) bool, True for ``losses`` (n,) that are far above the others; all False if there are fewer than
+    eight."""
     if len(losses) < 8:
         return np.zeros(len(losses), bool)
     logarithms = np.log(np.maximum(losses, 1e-12))

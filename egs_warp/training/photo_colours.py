@@ -25,7 +25,7 @@ _OPAQUE = 0.98
 """Minimum opacity of the capture at pixels whose colours are matched."""
 _MATCHING_ROUNDS, _MATCHED_PIXELS = 20, 10_000
 """Number of rounds that select the best-matching pixels, and maximum number of pixels, in the fit of a photo's colours
-to the capture's."""
+to the colours of the capture."""
 _REGULARIZATION = 1e-5
 """Weight of the distance between the mixing matrix and the diagonal matrix of the channels' own gains."""
 
@@ -63,8 +63,8 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
 
 
 def in_colours_of(reference: np.ndarray, photo: np.ndarray, shared: np.ndarray) -> np.ndarray:
-    """(H, W, 3) float32: ``photo`` (H, W, 3) with the exposure and white balance of ``reference`` (H, W, 3), fitted to
-    the pixels ``shared`` (H, W) bool.
+    """Return (H, W, 3) float32: ``photo`` (H, W, 3) with the exposure and white balance of ``reference`` (H, W, 3),
+    fitted to the pixels ``shared`` (H, W) bool.
 
     Training against the photo must not change colours relative to Gaussians that are not trained. The conversion is a
     linear mixing of the three channels, fitted by least squares to the three quarters of the pixels that agree best.

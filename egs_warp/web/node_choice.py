@@ -24,8 +24,8 @@ _STEP_TIME_PER_PROBE = 20.5
 """Mean time of a step of a jumping pawn with ``_STEP_NODES`` nodes, relative to the time of one pass of the probe under
 the same load (160 ms and 7.8 ms on two busy cores of a Xeon)."""
 _STEP_NODES, _STEP_EXPONENT = 250, 0.54
-"""Requested number of nodes in that measurement, and the exponent with which the step time grows with the number (97 ms
-and 7.0 ms were measured with 120 nodes)."""
+"""Requested number of nodes of ``_STEP_TIME_PER_PROBE``, and the exponent with which the step time grows with this
+number (97 ms and 7.0 ms were measured with 120 nodes)."""
 
 
 @dataclass(frozen=True)

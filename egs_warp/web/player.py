@@ -11,7 +11,10 @@ PLAYER = Path(__file__).parent / "player" / "dist" / "egs-player.js"
 
 
 def player_script() -> str:
-    """Return the module that defines ``<egs-player>``. Raises ``UserError`` if it has not been built."""
+    """Return the source text of the JavaScript module that defines ``<egs-player>``.
+
+    Raises ``UserError`` if it has not been built.
+    """
     try:
         return PLAYER.read_text(encoding="utf-8")
     except FileNotFoundError as error:

@@ -34,7 +34,7 @@ DISTANCE = 1.0 / np.tan(np.radians(0.5 * FOV_DEGREES))
 
 @dataclass(frozen=True)
 class Preview:
-    """The still capture as a run of one frame, in a frame that is close to that of the body."""
+    """The still capture as a run of one frame, in a frame that is close to the frame of the body."""
 
     header: bytes
     frame: bytes

@@ -138,7 +138,8 @@ class Session:
 
     @property
     def _is_suspended(self) -> bool:
-        """True if no step is to be computed: no page, paused, or at rest."""
+        """True if no step is to be computed: no page is open, or the session is paused or the body at rest, and no
+        single steps are requested."""
         if not self._mailbox.watched:
             return True
         return self._single_steps == 0 and (self._paused or self.resting)

@@ -93,7 +93,7 @@ def test_an_aim_is_judged_or_explained(harness: ModuleType) -> None:
 
 
 def test_data_folder(harness: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The folder is that of the environment variable, else the one next to the repository."""
+    """The data folder is set by the environment variable; by default it is next to the repository."""
     monkeypatch.setenv("EGS_WARP_DATA", "/elsewhere")
     assert harness.data_folder() == Path("/elsewhere")
     monkeypatch.delenv("EGS_WARP_DATA")

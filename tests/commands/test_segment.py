@@ -92,7 +92,7 @@ def test_without_cameras_a_ring_is_used_and_written(
     assert f"{out}: egs-warp plane wrote here, which cannot be resumed; start it again" in capsys.readouterr().err
     assert main([*again, "--overwrite"]) == 0
     assert (out / "earlier-1" / "images" / "ring11.png").is_file() and len(list((out / "images").iterdir())) == 12
-    # The file that was written can be clicked on.
+    # A pixel of a view in the written cameras.json selects the object.
     flags = ["--object", "256,256", "--cameras", str(out / "cameras.json"), "--view", "0", "--straddling", "none"]
     assert main(["segment", str(folder / "scene.ply"), *flags, "--out", str(tmp_path / "parts")]) == 0
 

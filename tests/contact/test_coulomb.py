@@ -90,7 +90,7 @@ def test_solutions_obey_coulombs_law_for_different_tangents(friction: float) -> 
 
 
 def test_nan_problems_return_the_initial_forces() -> None:
-    """The residual of such a problem is infinite, and the initial normal forces are returned."""
+    """If the problem contains a NaN, the residual is infinite and the initial normal forces are returned."""
     delassus, free, shift, start = problem(0)
     free[4] = np.nan
     forces, size = coulomb_forces(delassus, free, shift, 0.5, start)
@@ -212,7 +212,7 @@ def test_earlier_problems_do_not_change_the_result() -> None:
 
 
 def test_more_points_than_nodes_are_solved_by_continuation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The problems are those of the first step of a jump on 32 points of a coarse foot. The Newton kernel alone does
+    """The problems come from the first step of a jump on 32 points of a coarse foot. The Newton kernel alone does
     not converge from the current forces; continuation from compliant contacts does, also for many worlds.
     """
     creature = sagging(coarse_pawn())

@@ -204,8 +204,8 @@ def test_contacts_do_not_depend_on_the_prefetch(
 def test_a_tangent_whose_sum_is_indefinite_equals_the_host_s(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If the low-rank update by the muscles' stiffness fails, the whole matrix is factored; the iterate is that of the
-    host."""
+    """If the low-rank update by the muscles' stiffness fails, the whole matrix is factored; the iterate equals the
+    host's."""
     stepper = on_device(creature, device, monkeypatch)
     problem, *_ = problems(stepper, creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)

@@ -61,7 +61,7 @@ def test_a_newton_step_solves_the_linear_equation(creature: Creature) -> None:
 
 
 def test_a_new_tangent_changes_only_the_newton_step(creature: Creature) -> None:
-    """The new tangent is that of the iterate, with the muscles' stiffness."""
+    """The new tangent is evaluated at the iterate and includes the stiffness of the muscles."""
     problem, tension, random = falling(creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(5), problem.state.positions)
     first, second = (

@@ -184,7 +184,7 @@ def test_arms_follow_their_ends(device: str) -> None:
 
 def test_colour_rotates_with_the_mean_of_the_arms(device: str) -> None:
     """Eq. (15): a Gaussian that reaches into other tetrahedra rotates by the polar rotation of (F+ + F-)/2 (SciPy's),
-    which differs from that of the tetrahedron of its mean."""
+    which differs from the rotation of the tetrahedron that contains its mean."""
     mesh, cloud = box((4, 4, 4)), random_cloud(400, degree=0, scale=0.15, device=device)
     positions = bent(mesh.nodes, 1.0) + 0.01 * np.random.default_rng(2).normal(size=mesh.nodes.shape)
     embedding = embed_gaussians(cloud, mesh)

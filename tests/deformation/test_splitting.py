@@ -97,7 +97,7 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
     result = split_for_motion(cloud, embedding, frames, max_growth=20.0)
     after = Deformer(result.cloud, result.embedding).measure_bend(frames)
     visible = result.cloud.opacities() > 0.01
-    # Ends of tilted needles are outside the bar, where the fit error is that of the extrapolation.
+    # Ends of tilted needles are outside the bar, where the fit error is an extrapolation error.
     within, before_within = (e.points.inside.numpy().reshape(-1, 7).all(axis=1) for e in (result.embedding, embedding))
     assert within.mean() > 0.5
     assert after.fit_error[visible & within].max() < 0.6 * before.fit_error[before_within].max()
@@ -150,8 +150,8 @@ def test_an_affine_motion_splits_nothing() -> None:
 
 
 def test_an_animation_with_splits_has_no_pops() -> None:
-    """Eq. (17): over a growing bend, frames of the cloud split for the motion change as smoothly as those of the
-    unsplit one; the same measure detects a cloud that is split in the middle."""
+    """Eq. (17): over a growing bend, frames of the cloud split for the motion change as smoothly as frames of
+    the unsplit cloud; the same measure detects a cloud that is split in the middle."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
     cloud = bar_cloud()
     frames = [bent(mesh.nodes, 4.0 / angle) for angle in np.linspace(1.0, 1.02, 17)]

@@ -1,4 +1,4 @@
-"""The batched equations agree with those of each world alone."""
+"""The equations of a batch agree with the equations of each world alone."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_residuals(
     alone: list[StepProblem],
     pulling: bool,
 ) -> None:
-    """Forces, momentum corrections and residuals equal those of single worlds, with and without muscles."""
+    """Forces, momentum corrections and residuals equal the results of single worlds, with and without muscles."""
     given = tried(states)
     velocities, tensions = torch.from_numpy(given), torch.from_numpy(muscles.stiffness * activations)
     pulls = [MuscleEnergy.of(muscles, one) if pulling else None for one in activations]
@@ -140,8 +140,8 @@ def test_tangents(
     pulling: bool,
     chunk_bytes: int,
 ) -> None:
-    """Velocity changes by impulses equal those of single worlds, with and without the stiffness of muscles. A momentum
-    projection that is passed in is reused."""
+    """Velocity changes by impulses equal the changes in single worlds, with and without the stiffness of muscles. A
+    momentum projection that is passed in is reused."""
     beside = problem_of(BatchBody(body, muscles, 4, panel=32, chunk_bytes=chunk_bytes), states)
     given, impulses = tried(states), np.random.default_rng(3).standard_normal((3, given_size(body), 4))
     pulls = [MuscleEnergy.of(muscles, one) for one in activations] if pulling else [None] * 3
@@ -158,8 +158,8 @@ def test_tangents(
 def test_tangents_of_muscles_that_are_half_slack(
     body: SoftBody, muscles: MuscleSet, activations: np.ndarray, states: list[BodyState], alone: list[StepProblem]
 ) -> None:
-    """At lengths from 0.35 to 0.65 of the rest length, the tension depends on the length. Velocity changes equal those
-    of single worlds and differ from the ones without muscles."""
+    """At lengths from 0.35 to 0.65 of the rest length, the tension depends on the length. Velocity changes
+    equal the changes in single worlds and differ from the changes without muscles."""
     half = replace(muscles, rest_lengths=muscles.rest_lengths / np.linspace(0.35, 0.65, muscles.segment_count))
     beside, given, pulls = problem_of(BatchBody(body, half, 4), states), tried(states), np.abs(activations)
     assert beside.factor(torch.from_numpy(given), torch.from_numpy(half.stiffness * pulls)).all()

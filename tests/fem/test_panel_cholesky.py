@@ -39,7 +39,7 @@ def test_solutions_equal_those_of_numpy(matrices: np.ndarray, panel: int, chunk_
         made = factors.solve(torch.from_numpy(right)[worlds], worlds).numpy()
         at = [worlds.tolist().index(world) for world in fine]
         np.testing.assert_allclose(made[at], np.linalg.solve(matrices[fine], right[fine]), rtol=0, atol=1e-13)
-    # Overwrite slot 2 by twice the first matrix, given as entries, a diagonal and a term.
+    # Overwrite slot 2 with twice the first matrix, given as entries, a diagonal and a term.
     half = torch.from_numpy(np.tril(matrices[:1]))
     diagonal = half[0].diagonal()
 

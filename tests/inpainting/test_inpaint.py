@@ -98,7 +98,7 @@ def test_new_gaussians_are_flat_dense_and_lie_on_the_plane(done: tuple[GaussianC
 def test_new_gaussians_have_the_gloss_of_the_floor_but_their_own_colour(
     done: tuple[GaussianCloud, InpaintResult],
 ) -> None:
-    """The highlight is that of the floor; the mean colour over all directions is the painted one."""
+    """The new Gaussians have the highlight of the floor; the painting gives their mean colour over all directions."""
     truth, result = done
     new = result.cloud.subset(result.is_new)
     assert new.sh.numpy()[:, 1:] == pytest.approx(

@@ -65,7 +65,7 @@ FILES = {
 @pytest.mark.data
 @pytest.mark.parametrize("name", FILES)
 def test_real_captures_read(name: str, data_dir: Path) -> None:
-    """Counts and degrees are those of the README of the data; sizes and colours are plausible for a visible object."""
+    """Counts and degrees agree with the README of the data; sizes and colours are plausible for a visible object."""
     capture = read_capture(data_dir / name, device="cpu")
     cloud = capture.cloud
     assert (capture.format, cloud.count, cloud.sh_degree, capture.infinite_opacities) == FILES[name]

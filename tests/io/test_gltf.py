@@ -218,8 +218,8 @@ def _euler(*degrees: float) -> Rotation:
     ],
 )
 def test_turned_mirrored_and_stretched_nodes(rotation: Rotation, scale: tuple[float, ...], tmp_path: Path) -> None:
-    """Covariances become M Sigma M^T. The colour seen along Q d equals the one that was seen along d, where Q is the
-    orthogonal factor of M."""
+    """Covariances become M Sigma M^T. With the orthogonal factor Q of M, the colour seen along Q d equals the
+    original colour seen along d."""
     cloud = make_cloud(40, 3)
     second = {"mesh": 0, "rotation": rotation.as_quat().tolist(), "scale": scale, "translation": [1, 2, 3]}
     read = _with_nodes(tmp_path, cloud, [{"mesh": 0}, second]).cloud.subset(np.arange(40, 80))

@@ -176,7 +176,7 @@ def test_cameras_of_no_photo(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["../secret.png", "/secret.png", "a/../../secret.png"])
 def test_photos_outside_of_the_folder_are_not_looked_for(name: str, tmp_path: Path) -> None:
-    """The result does not depend on the existence of such a photo."""
+    """The result does not depend on whether a photo outside the folder exists."""
     folder = tmp_path / "poses"
     folder.mkdir()
     Image.new("RGB", (4, 4)).save(tmp_path / "secret.png")

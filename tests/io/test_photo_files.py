@@ -63,7 +63,7 @@ def test_colmap_photos(model: str, folder: str, names: tuple[str, ...], files: t
     for number, file in enumerate(files):
         (tmp_path / folder / file).parent.mkdir(parents=True, exist_ok=True)
         Image.new("L", (4, 3), number).save(tmp_path / folder / file, "PNG")
-    # Pictures that are no photos must not be taken for them.
+    # Pictures that are not photos must not be read as photos.
     for other in ("masks", "depth", "images/thumbnails"):
         if not (folder == "." and other.startswith("images")):
             for file in files:
@@ -71,7 +71,7 @@ def test_colmap_photos(model: str, folder: str, names: tuple[str, ...], files: t
                 Image.new("L", (4, 3), 99).save(tmp_path / other / file, "PNG")
     expected = [os.path.normpath(f"{folder}/{file}") for file in files]
     assert found(read_posed_images(tmp_path), tmp_path) == expected
-    # The result is that of the model's own folder.
+    # Reading the model's own folder gives the same result.
     assert found(read_posed_images(tmp_path / model), tmp_path) == expected
 
 

@@ -51,7 +51,7 @@ def test_reality_scan(kind: str, tmp_path: Path) -> None:
     text = ("\r\n" if kind == "crlf" else "\n").join(lines)
     encoding = {"mark": "utf-8-sig", "utf-16": "utf-16"}.get(kind, "utf-8")
     (tmp_path / "cameras.csv").write_bytes(text.encode(encoding))
-    # A table of something else is not taken for poses.
+    # A table with other columns is not read as poses.
     (tmp_path / "a.csv").write_text("name,value\na,1\n")
     for source in (tmp_path, tmp_path / "cameras.csv"):
         poses = read_posed_images(source)

@@ -159,7 +159,7 @@ def test_remnants_of_a_killed_run_are_removed_by_the_next(tmp_path: Path) -> Non
 
 
 def test_a_run_killed_before_its_first_file_does_not_count(tmp_path: Path) -> None:
-    """The manifest of such a run lists files, but none of them exists."""
+    """The manifest of a run that was killed this early lists files, but none of them exists."""
     with run_folder(tmp_path) as run:
         run.file("a.txt")
     assert manifest(tmp_path)["files"] == {"a.txt": None}

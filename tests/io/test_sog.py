@@ -179,7 +179,10 @@ def test_bad_json(tmp_path: Path) -> None:
         ({"lods": {"0": {"file": 0, "offset": -1, "count": 1}}}, "malformed leaf in lod-meta.json"),
         ({"children": 5}, "malformed tree in lod-meta.json"),
         ({"children": [[]]}, "malformed tree in lod-meta.json"),
-        ({"lods": {"0": {"file": 0, "offset": 4, "count": 4}}}, "truncated: a/meta.json has 7 Gaussians"),
+        (
+            {"lods": {"0": {"file": 0, "offset": 4, "count": 4}}},
+            "truncated: a/meta.json has 7 Gaussians, expected at least 8",
+        ),
         ({"lods": {}}, "it has no Gaussians"),
     ],
 )

@@ -127,7 +127,7 @@ def test_a_hessian_with_nan_has_no_optimum() -> None:
 
 
 def test_earlier_programs_do_not_change_the_result() -> None:
-    """The memory is reused by programs with more rows and with fewer; the bits are the same."""
+    """The workspace is reused by programs with more constraints and with fewer; the result is bitwise the same."""
     programs = [random_program(seed) for seed in (4, 5, 6)]
 
     def found(P: np.ndarray, q: np.ndarray, A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
@@ -140,7 +140,7 @@ def test_earlier_programs_do_not_change_the_result() -> None:
 
     for P, q, A, lower, upper in programs:
         expected = found(P, q, A, lower, upper)
-        # Programs with as many unknowns: with more rows, with fewer, and with equalities only.
+        # Solve programs with the same number of unknowns, first with more constraints, then with fewer.
         found(P, -q, np.vstack([A, -A]), np.r_[lower, -upper], np.r_[upper, -lower])
         found(P, 3.0 * q, A[: len(q) + 2], lower[: len(q) + 2], upper[: len(q) + 2])
         for got, value in zip(found(P, q, A, lower, upper), expected, strict=True):
@@ -148,7 +148,7 @@ def test_earlier_programs_do_not_change_the_result() -> None:
 
 
 def test_whitened_coordinates() -> None:
-    """z = 0 is the minimum, the cost increases from there by half of |z|^2, and rows have unit length in z."""
+    """z = 0 is the minimum, elsewhere the cost is higher by half of |z|^2, and rows have unit length in z."""
     for seed in range(20):
         P, q, A, _, _ = random_program(seed)
         rows = WhitenedQp.of(P, q, A)

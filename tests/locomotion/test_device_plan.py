@@ -130,8 +130,8 @@ def test_device_plans_equal_host_plans(creature: Creature, stepper: LocomotionSt
 def test_the_solve_continues_from_the_end_of_the_plan(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The plan has already queued the first Newton step, so the solve makes no further request. The step equals one
-    that is requested explicitly."""
+    """The plan has already queued the first Newton step, so the solve makes no further request. The step equals an
+    explicitly requested step."""
     memory = stepper.initial_memory()
     start = begun(stepper, creature.start, memory)
     found = planner_of(stepper).plan(start, asks(creature, 0.1))
@@ -197,8 +197,9 @@ def test_a_replan_equals_that_of_the_host(creature: Creature, stepper: Locomotio
 def test_a_restart_equals_that_of_the_host(
     what: str, beside: bool, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If the first search has a high cost, a second search runs, concurrently or afterwards. The plan equals that of
-    the host, and the solve starts from its end. The search is left to the host only after a numerical failure.
+    """If the first search has a high cost, a second search runs, concurrently or afterwards. The plan equals the host's
+    plan, and the contact solve starts from the end of the plan. Only after a numerical failure is the search left to
+    the host.
     """
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     monkeypatch.setattr(device_plan, "PARALLEL_RESTART_COST", 0.0 if beside else np.inf)

@@ -140,8 +140,8 @@ def test_part_rows_are_the_rate_of_the_part_s_centre(part: BodyPart, frame: Coor
 @by_part
 @by_frame
 def test_momentum_rows_measure_the_angular_momentum(part: BodyPart, frame: Coordinates) -> None:
-    """The rows give the sum of m (x - c) x (v - v_c) over the part, about its own centre or that of the body, scaled to
-    m/s; a rigid rotation gives the inertia times omega.
+    """The rows give the sum of m (x - c) x (v - v_c) over the part, about the centre of the part or of the body, scaled
+    to m/s; a rigid rotation gives the inertia times omega.
     """
     state = shaken_state()
     v = np.random.default_rng(5).standard_normal(state.positions.shape)

@@ -48,8 +48,8 @@ def works(stepper: LocomotionStepper, start: np.ndarray, end: np.ndarray, tensio
 
 
 def test_activations_cost_the_squares_of_their_muscles_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The work cost adds the squared works to the diagonal of P. It does not change the gradient, the constant, or the
-    entries of contact forces."""
+    """For each group, the work cost adds the squares of the work of the group's segments to the diagonal of P. It does
+    not change the gradient, the constant, or the entries of contact forces."""
     stepper, states, reports = thrust(7)
     muscles, start = stepper.muscles, states[-1]
     memory = WarmStart.from_report(reports[-1])
@@ -75,7 +75,7 @@ def test_activations_cost_the_squares_of_their_muscles_work(monkeypatch: pytest.
 
 
 def test_a_work_cost_reduces_the_work_of_a_thrust(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the work cost, the sum of the positive works of all segments is at least 5 % lower, and the final speed is
+    """With the work cost, the sum of the positive work of all segments is at least 5 % lower, and the final speed is
     the same to 2 %."""
 
     def worked(steps: int = 8) -> tuple[float, float]:

@@ -44,7 +44,7 @@ def test_closed_form(solver: QpSolver, accuracy: float) -> None:
 @SOLVERS
 def test_updated_bounds_give_the_optimum_of_a_new_solver(solver: QpSolver, accuracy: float) -> None:
     """Eq. (13): rows change between free, one-sided and equality, as contact states do; the KKT conditions hold, and x
-    is that of a new solver.
+    equals the result of a new solver.
     """
     P, q, A = random_program(0)
     for rows in (A, np.vstack([np.eye(20), A[:10]])):  # plain bounds first, as in the contact program

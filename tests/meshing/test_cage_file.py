@@ -82,7 +82,7 @@ def test_problems_are_one_line(tmp_path: Path) -> None:
     assert "are flat or turned inside out, the first at [" in refusal(written(path, moved, mesh.tets))
     both = np.concatenate([mesh.nodes, mesh.nodes + [50.0, 0.0, 0.0]])
     assert "has 2 parts" in refusal(written(path, both, np.concatenate([mesh.tets, mesh.tets + len(mesh.nodes)])))
-    sunk = "is 0.12 heights of the mesh below the ground; move it up"
+    sunk = "is below the ground by 0.12 times the height of the mesh; move it up, and check that the mesh is in the"
     assert sunk in refusal(written(path, mesh.nodes - [0.0, 0.0, 1.0], mesh.tets))
     assert "a node does not have three finite coordinates" in refusal(written(path, mesh.nodes * 1e30, mesh.tets))
 

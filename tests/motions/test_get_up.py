@@ -63,7 +63,7 @@ def test_the_highest_point_is_over_the_edge_of_the_roll(degrees: float) -> None:
 
 def test_the_body_rotates_about_the_edge_of_its_base() -> None:
     """The target velocity of the centre of mass and the target spin form one rotation about the lower edge of the base.
-    Later, the spin is that of a body that falls back about this edge."""
+    Later, the spin equals the spin of a body that falls back about this edge."""
     get_up, state = GetUp(block().place), lying(90.0)
     get_up.phase, get_up._entered, get_up._push = GetUpPhase.ROLL, 0.0, 50.0
     com, spin, _ = get_up.objectives(replace(state, time=0.05), None, DT)

@@ -19,8 +19,8 @@ from tests.support.stances import DT, block_place, moved
 
 
 def test_the_landing_frame_is_that_of_the_landed_body(place: Stance) -> None:
-    """From take-off on, local coordinates are relative to the target: a body that stands there, rotated, has the local
-    coordinates of the start."""
+    """From take-off on, local coordinates are relative to the target: a body that stands at the target, rotated, has
+    the local coordinates of the start."""
     target = JumpTarget(0.5, 0.3, 0.1)
     jump = Jump(place, target, facing=TurnHeading(place, 0.8))
     start = place.ground.local(place.standing)

@@ -90,7 +90,7 @@ def test_a_weight_applies_until_its_key(tmp_path: Path) -> None:
         ),
         (
             [{**GOOD, "part": "tail"}],
-            "key 1: part 'tail' is unknown; give one of body, base, head, foot, or of several feet foot 1",
+            "key 1: part 'tail' is unknown; give one of body, base, head, foot, or a numbered part: foot 1, ",
         ),
         ([{**GOOD, "part": "foot 0"}], "key 1: part 'foot 0' is unknown"),
         ([{**GOOD, "part": ["head"]}], "key 1: part ['head'] is unknown"),

@@ -126,8 +126,8 @@ def test_legs_on_a_thick_slab_stand_on_one_base() -> None:
 
 @pytest.mark.parametrize(("length", "count"), [(1.4, 2), (0.8, 4)])
 def test_legs_on_runners_stand_on_the_runners(length: float, count: int) -> None:
-    """A body on two long runners, such as an armchair, has two feet. If the legs are close, as those of a chair, their
-    connection may be a flaw of the capture, and there are four feet. Mesh and lattice solid are tested."""
+    """A body on two long runners, such as an armchair, has two feet. If the legs are close, like the legs of a chair,
+    their connection may be a flaw of the capture, and there are four feet. Mesh and lattice solid are tested."""
 
     def sledge(p: np.ndarray) -> np.ndarray:
         posts = (np.abs(np.abs(p[:, 0]) - 0.5 * length + 0.1) < 0.1) & (np.abs(np.abs(p[:, 1]) - 0.4) < 0.1)

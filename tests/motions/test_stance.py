@@ -24,8 +24,8 @@ def measured_body(
 
 
 def swing(place: Stance, state: BodyState, seen: Measurement, spin: np.ndarray) -> np.ndarray:
-    """Return the velocity (2,), m/s, of the centre of mass whose angular momentum about the feet equals that of a
-    ``spin`` (3,), rad/s."""
+    """Return the velocity (2,), m/s, of the centre of mass whose angular momentum about the feet equals the
+    angular momentum of a rotation with ``spin`` (3,), rad/s."""
     momentum = place.ground.axes @ place.body.inertia(state.positions) @ spin / (place.body.mass * seen.com[2])
     return np.array([momentum[1], -momentum[0]])
 
@@ -69,9 +69,9 @@ def test_balance_targets_are_the_nearest_that_do_not_tip(
 
 @pytest.mark.parametrize(("ahead", "is_driven"), [(0.02, True), (0.12, False)])
 def test_uprighting_does_not_drive_a_body_off_its_feet(place: Stance, ahead: float, is_driven: bool) -> None:
-    """A body at rest should rotate backward faster than its feet allow, so the centre of pressure is at the edge. If
-    the centre of mass is near the middle of the support, the body also moves forward; if it is half-way to the edge, it
-    does not."""
+    """The requested backward rotation of a body at rest is faster than its feet allow, so the centre of pressure is at
+    the edge. If the centre of mass is near the middle of the support, the body also moves forward; if it is half-way to
+    the edge, the body does not."""
     pose, state, seen = measured_body(place, 1e3, (ahead, 0.0, 0.0))
     velocity, turned = pose.balance_targets(seen, np.zeros(3), np.array([0.0, -2.0, 0.0]), DT)
     assert velocity[0] > 1e-3 if is_driven else velocity[0] == pytest.approx(0.0, abs=1e-12)

@@ -79,7 +79,7 @@ def test_a_twist_spins_up_with_the_upward_speed(place: Stance) -> None:
 
 
 def test_in_the_air_the_width_is_adjusted_to_the_turn(place: Stance) -> None:
-    """The angular momentum L is conserved in flight, so a body that should turn by the remaining angle in the remaining
+    """The angular momentum L is conserved in flight, so a body that has to turn by the remaining angle in the remaining
     time t needs the inertia L t / angle. The target width gives this inertia, and its rate is proportional to the
     difference of the widths. At the spin that fits the standing shape, the target is zero."""
     turn, speed = 1.5, 2.5

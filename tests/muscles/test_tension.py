@@ -223,8 +223,9 @@ def test_a_tendon_holds_straight_the_rod_that_a_dead_load_buckles(rod: SoftBody)
 def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
     rod: SoftBody, share: float, dt: float
 ) -> None:
-    """A free rod is compressed by its tendon with ``share`` times Euler's buckling load. The tangent equals dense
-    matrices below and above this load, where the elastic part is indefinite."""
+    """A free rod is compressed by its tendon with ``share`` times Euler's buckling load. Solutions for
+    the tangent satisfy the dense equations up to a rigid rotation, below this load and also above it, although the
+    elastic part is indefinite above."""
     euler = np.pi**2 * rod.young_modulus * 0.08**4 / 12 / 0.9**2
     tension = MuscleEnergy(tendon(6).difference_rows, np.full(6, share * euler), tendon(6).rest_lengths)
     still = np.zeros_like(ROD.nodes)

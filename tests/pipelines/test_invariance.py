@@ -135,8 +135,8 @@ def test_a_trajectory_maps_back_to_the_capture(elsewhere: tuple[Lying, Creature,
 
 
 LIMIT = 0.01
-"""Relative tolerance of distance and height. All cases should have the bits of the first one; if a single one of some
-10,000 contact points is rounded differently, the jump may change by up to 2 %.
+"""Relative tolerance of distance and height. The cases are expected to be bitwise equal to the first one; if a single
+one of some 10,000 contact points is rounded differently, the jump may change by up to 2 %.
 """
 CHANGES: dict[str, Callable[[Lying], Lying]] = {
     "x0.37": lambda thing: thing.scaled(0.37),

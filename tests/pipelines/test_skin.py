@@ -75,7 +75,7 @@ def test_the_surface_of_the_cage_moves_as_in_the_run(run: FinishedRun, run_folde
     triangles = skin.array(skin.text["meshes"][0]["primitives"][0]["indices"]).reshape(-1, 3)
     corners = skin.vertices(0)[triangles]
     volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0
-    assert volume > 0.0  # Wound outwards.
+    assert volume > 0.0  # The triangles are oriented outwards.
 
 
 def test_a_mesh_in_the_frame_of_the_capture_moves_with_the_cage(

@@ -140,8 +140,8 @@ SLEEPERS = """
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("crew", ["2", pytest.param("ray", marks=[NO_RAY, pytest.mark.slow])])
 def test_no_worker_outlives_the_program(number: signal.Signals, crew: str, tmp_path: Path) -> None:
-    """Ctrl-C, which a terminal sends to the whole group, gives one line; no worker is left even if the program is
-    killed."""
+    """Ctrl-C, which a terminal sends to the whole process group, prints one line. No worker is left, even if the
+    program is killed."""
     program = started(SLEEPERS, str(tmp_path), crew)
     try:
         until(lambda: len(list(tmp_path.iterdir())) == 2)

@@ -203,7 +203,8 @@ def test_images_keep_the_memory_of_their_gradients(device: str) -> None:
 
 
 def test_masked_tiles_show_the_background_and_have_no_gradient(device: str) -> None:
-    """Gradients equal those of a loss without the masked tiles. The tiles are those of gsplat's masks."""
+    """Gradients equal the gradients of a loss without the masked tiles. Tiles have the size of the tiles in gsplat's
+    masks."""
     values, camera = many_splats()
     mask = np.random.default_rng(5).random((5, 6)) < 0.5
     pixels = torch.tensor(np.kron(mask, np.ones((16, 16), bool))[:70, :90], device=device)

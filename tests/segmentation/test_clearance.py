@@ -69,8 +69,8 @@ def test_reach_is_that_of_the_six_tips_or_of_the_whole_ellipsoid(device: str) ->
 
 
 def test_half_above_has_the_moments_of_the_cut_normal_distribution(device: str) -> None:
-    """The moments equal those of SciPy's truncated normal distribution along N, and across N those of its linear
-    regression."""
+    """The moments along N equal the moments of SciPy's truncated normal distribution; the moments across N follow from
+    them by linear regression."""
     cloud = cloud_near(PLANE, device)
     chosen = np.arange(cloud.count) % 3 != 0
     half = half_space(cloud, PLANE, chosen)
@@ -86,8 +86,8 @@ def test_half_above_has_the_moments_of_the_cut_normal_distribution(device: str) 
         expected = sigma0[k] - hazard * (hazard - t) * np.outer(along, along)
         np.testing.assert_allclose(sigma1[k], expected, atol=3e-5 * np.trace(sigma0[k]) + 1e-9)
         assert PLANE.heights(means1[k]) > 0.0
-        # Viewed along the plane, its mass is that of the part above the plane, unless its peak would exceed the
-        # original.
+        # Viewed along the plane, the new Gaussian has the mass of the part above the plane, unless its peak would
+        # exceed the original peak.
         mass = half.opacities()[k] * np.sqrt(n @ sigma1[k] @ n)
         share = min(norm.sf(t), np.sqrt(n @ sigma1[k] @ n) / spread)
         assert mass == pytest.approx(cloud.opacities()[k] * spread * share, rel=1e-3)

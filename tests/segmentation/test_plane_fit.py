@@ -84,8 +84,8 @@ def test_exact_depth_gives_the_exact_plane() -> None:
 
 
 def test_weights_of_one_over_the_residual_reject_outliers() -> None:
-    """Weights of 1 / abs(residual) turn least squares into least absolute residuals: if a fifth of exact depths are
-    wrong, all to one side, the plane is still exact."""
+    """Weights of 1 / abs(residual) turn least squares into least absolute residuals: if a fifth of the depths are too
+    small and the others exact, the plane is still exact."""
     camera = camera_over(TRUTH, 0.7)
     depth = plane_depth(TRUTH, camera)
     mask = (depth > 0.0) & (depth < 12.0)

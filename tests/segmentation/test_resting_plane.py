@@ -122,7 +122,7 @@ def found_on(cloud: GaussianCloud) -> LocatedPlane:
 
 
 def test_a_tilted_visible_surface_is_replaced_by_the_resting_plane() -> None:
-    """A visible surface that is tilted by 8 degrees counts as haze, and one tilted by 3 degrees as a table."""
+    """A visible surface that is tilted by 8 degrees is treated as haze, a surface tilted by 3 degrees as a table."""
     laid, seen = found_on(box_on_haze(8.0)), found_on(box_on_haze(3.0))
     assert not laid.in_sight and laid.fit is None and seen.in_sight
     assert "laid under the object's lowest parts" in laid.notes[-1]

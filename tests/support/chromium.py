@@ -51,7 +51,7 @@ def opened(
 ) -> tuple[Any, list[str]]:
     """Open a page and wait until it is loaded; return the page and the list of the browser's errors and warnings.
 
-    Unless ``plays`` is true, a recorded run is stopped at its first frame. ``scripts`` run before those of the page;
+    Unless ``plays`` is true, a recorded run is stopped at its first frame. ``scripts`` run before the page's own;
     ``context`` has further settings of the browser, such as ``color_scheme``.
     """
     page = chromium.new_page(viewport={"width": width, "height": height}, **context)

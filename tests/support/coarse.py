@@ -34,7 +34,7 @@ def coarse_cages(nodes: int) -> Iterator[None]:
 
 
 def coarse_main(arguments: Sequence[str] | None = None) -> int:
-    """Run ``egs-warp`` with these arguments, or those of the process, and coarse cages; return its exit status."""
+    """Run ``egs-warp`` with coarse cages; return its exit status. ``arguments`` default to those of the process."""
     with coarse_cages(int(os.environ.get("EGS_WARP_TEST_NODES", NODES))):
         return main(arguments)
 

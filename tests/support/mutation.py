@@ -46,7 +46,7 @@ class Outcome:
     """Result of one mutant."""
 
     kind: str
-    """The reason of the failure, ``assertion``, ``exception`` or ``time`` (limit), or ``survived``."""
+    """Reason for the failure (``assertion``, ``exception`` or ``time`` limit), or ``survived``."""
     seconds: float
     test: str
     """The test that failed."""

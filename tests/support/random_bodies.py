@@ -26,7 +26,7 @@ class Shape:
     size: tuple[float, float, float]
     """Size along x, y and z, m."""
     taper: float
-    """Width of the top divided by that of the base."""
+    """Width of the top divided by the width of the base."""
     sag: float
     poisson_ratio: float
     damping_ratio: float

@@ -112,7 +112,8 @@ def test_regularization_and_jitter_equal_their_formulas() -> None:
     )
     sigma = turn @ np.diag([0.09, 0.01, 0.0004]) @ turn.T
     gate = 1 / (1 + np.exp(100 * (1 / (1 + np.exp(9.0)) - 0.005)))
-    # 5e5 times the learning rate of the means, 1e-4 times the extent, divided by the squared extent for covariances.
+    # Scale of the noise: 5e5 times the learning rate of the means (1e-4 times the extent of 2), divided by the squared
+    # extent, because covariances scale with it.
     size = 5e5 * 2e-4 / 4.0 * gate
     moved = tensors["means"].detach().numpy().astype(float)
     np.testing.assert_allclose(np.cov(moved.T), size**2 * sigma @ sigma, atol=0.08 * (size * 0.09) ** 2)

@@ -160,7 +160,7 @@ def test_the_ground_and_the_front_are_dragged(chromium: Any, tmp_path: Path):
         changed(page, lambda: page.click("#undo"))
         changed(page, lambda: page.click("#undo"))
         assert session.state.pick.plane is before.plane
-        # Uneven ground moves with its plane, and is that of one object.
+        # Uneven ground stays visible when its plane moves, and is hidden for another object.
         assert page.evaluate(
             """() => {
                 const { gizmos, state } = egs.pick, [x, y, z, d] = state.plane;

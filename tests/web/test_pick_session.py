@@ -139,7 +139,7 @@ def test_the_thread_sends_labels_state_and_measurements(tmp_path: Path):
         feed.receive({"type": "mark", "inside": True, "pixels": [[1, 1]], **point})
         latest = events_until(session, lambda latest: "told" in latest)
         assert latest["told"]["text"] == "nothing is there; click on the object"
-        # A page that opens later receives the same.
+        # A page that is opened later receives the same events.
         session.subscribe(lambda: None)
         again = events_until(session, lambda latest: {"pick", "labels", "work"} <= set(latest))
         assert again["pick"]["plane"] == session.pick_event()["plane"]

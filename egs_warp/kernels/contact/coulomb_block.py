@@ -210,8 +210,8 @@ def sweep_by_block(
     sweeps: int,
     forces: wp.array[real],
 ) -> None:
-    """Perform ``sweep`` over ``count`` contacts, 1 to ``MAX_SWEPT_CONTACTS``; ``shared_address`` is the result of
-    ``shared_memory``.
+    """Perform ``sweeps`` Gauss-Seidel sweeps (``sweep``) over ``count`` contacts, 1 to ``MAX_SWEPT_CONTACTS``;
+    ``shared_address`` is the result of ``shared_memory``.
     """
     ...
 

@@ -32,7 +32,7 @@ def point_gaps_kernel(
     gaps_out: wp.array2d[real],
     planes_out: wp.array2d[int],
 ):
-    """Compute the signed distance of each embedded point of each world to the nearest solid, and the plane of that
+    """Compute the signed distance of each embedded point of each world from the nearest solid, and the plane of that
     solid with the largest signed distance.
 
     A solid is the intersection of the half spaces behind its planes, which are consecutive. The largest signed distance

@@ -75,11 +75,11 @@ def ground_gaps_kernel(
     gaps: wp.array2d[real],
     faces: wp.array2d[int],
 ):
-    """Compute the distance of each embedded point of each world to the tangent plane of the ground below it, and merge
-    it into ``gaps``.
+    """Compute the distance of each embedded point of each world from the tangent plane of the ground below it, and
+    merge it into ``gaps``.
 
-    If the ground is nearer than the obstacle in ``gaps``, the distance of the ground is stored and ``faces`` becomes 0.
-    Otherwise ``faces`` is incremented by 1, since the ground is face 0.
+    If the ground is nearer than the obstacle in ``gaps``, the distance from the ground is stored and ``faces`` becomes
+    0. Otherwise ``faces`` is incremented by 1, since the ground is face 0.
     """
     world, point = wp.tid()
     x = embedded_point(nodes[point], weights[point], positions, world)

@@ -203,7 +203,8 @@ def apply_update(
     solved: wp.uint64,
     contact_velocities_out: wp.uint64,
 ) -> None:
-    """Overwrite ``solved`` (3N,) with ``velocities`` - ``solved``, and compute the contact velocities (3n,) there."""
+    """Overwrite ``solved`` (3N,) with ``velocities`` - ``solved``, and compute the contact velocities (3n,)
+    of the result."""
     ...
 
 
@@ -277,7 +278,7 @@ def newton_kernel(
     contact_velocities_out: wp.uint64,
 ):
     """Compute the velocities (3N,) in m/s after a Newton step for the residual ``right_side`` (3N,) in N s, and the
-    contact velocities (3n,) there.
+    resulting contact velocities (3n,) in m/s.
     """
     solve_vector_native(
         fronts, blocks, unknowns, factor, inverses, reciprocals, right_side, 1, scratch, free_velocities_out

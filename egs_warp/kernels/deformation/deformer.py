@@ -223,7 +223,7 @@ def measure_bend_kernel(
         f_minus = affine_of(cage, plan.end_tets[3 + k, row]).gradient * axes
         reach = reach_of(arms, row, k, scales[k])
         for j in range(3):
-            # Along axis k the positions of the ends are known; across it only the gradients at the ends are.
+            # Along axis k, the positions of both ends are known; along other axes, only the gradients at the ends.
             a = wp.where(j == k, column(both.plus, k), column(f_plus, j))
             b = wp.where(j == k, column(both.minus, k), column(f_minus, j))
             axis_error = scales[k] * scales[j] * wp.length(a - b) / reach

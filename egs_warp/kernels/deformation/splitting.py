@@ -26,7 +26,7 @@ def split_kernel(
     """Write a copy of Gaussian ``parents[row]``, or, where ``axes[row]`` is not -1, one of its children.
 
     A child is displaced along the axis ``axes[row]`` by ``offsets[row]`` standard deviations of the parent. Its
-    standard deviation along this axis is ``shrink`` times the parent's.
+    standard deviation along this axis is ``shrink`` times the standard deviation of the parent.
     """
     row = first_row + wp.tid()
     parent = parents[row]

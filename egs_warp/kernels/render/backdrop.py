@@ -128,7 +128,7 @@ class Studio:
     """Sky from ``sky_rise`` on."""
     line: wp.vec3
     cell: wp.float32
-    """Distance of the fine lines, world units."""
+    """Spacing of the fine grid lines, world units."""
     clear_depth: wp.float32
     """z-depth up to which the floor is clear; it reaches the colour of the horizon at ``hazy_depth``."""
     hazy_depth: wp.float32

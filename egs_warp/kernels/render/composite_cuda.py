@@ -34,7 +34,7 @@ _SHARED += """
     };
 """
 
-# All splats of the tile pass through shared memory, 256 at a time; ``group`` iterates over them by 32.
+# All splats of the tile pass through shared memory in batches of 256; ``group`` iterates over a batch in steps of 32.
 _BATCHES = """
     __shared__ float4 s_shape[256];
     __shared__ float4 s_colour[256];
