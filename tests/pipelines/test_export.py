@@ -225,7 +225,8 @@ def test_frames_are_not_put_among_the_files_of_a_run(
     before = sorted(run_folder.iterdir())
     for command in (["export", str(run_folder), "--to", "ply"], ["render", str(run_folder), "--size", "32"]):
         assert main([*command, "--out", str(run_folder)]) == 2
-        assert f"{run_folder}: it is the folder of a run, and these files would be mixed with it" in capsys.readouterr().err
+        message = f"{run_folder}: it is the folder of a run, and these files would be mixed with it"
+        assert message in capsys.readouterr().err
     assert sorted(run_folder.iterdir()) == before
 
 
