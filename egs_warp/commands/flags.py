@@ -107,7 +107,7 @@ def parse_up(text: str) -> np.ndarray:
 def parse_direction(flag: str, text: str) -> np.ndarray:
     """Return the (3,) unit vector of ``x,y,z`` or of an axis name such as ``-y``.
 
-    Raises ``UserError``, which names ``flag``, for other texts.
+    Raises ``UserError``, which names ``flag``, for any other text.
     """
     import numpy as np
 

@@ -25,11 +25,11 @@ _GROUPS = 4
 """Number of groups of surfaces by chromaticity; each has its own albedo."""
 _MAX_CASTERS, _MAX_SURFACES = 6_000, 6_000
 _REACH = 2.4
-"""Radius of the compared ground, in sizes of the object."""
+"""Radius of the compared ground, relative to the object's size."""
 _CELL = 0.06
-"""Side of a cell of the ground, in sizes of the object."""
+"""Side of a cell of the ground, relative to the object's size."""
 _ON_GROUND = 0.06
-"""Maximum height of Gaussians of the ground, in sizes of the object."""
+"""Maximum height of ground Gaussians, relative to the object's size."""
 _COVERED = 0.35
 """Minimum coverage of a cell by the object, seen from above, relative to the most covered cell, at which no photo shows
 the cell."""

@@ -89,13 +89,13 @@ def quadratic_program(
     solver: QpSolver | str = QpSolver.OSQP,
     accuracy: float = 3e-5,
 ) -> QuadraticProgram:
-    """Set up the QP for ``solver`` (or its name), ``osqp`` or ``daqp``.
+    """Set up the QP for a solver.
 
     Args:
         P: (n, n) Hessian.
         q: (n,) linear term.
         A: (m, n) constraint rows.
-        solver: the solver.
+        solver: solver, or its name ``osqp`` or ``daqp``.
         accuracy: accuracy of operator splitting, absolute and relative.
     """
     if QpSolver(solver) is QpSolver.DAQP:

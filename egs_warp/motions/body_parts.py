@@ -18,8 +18,8 @@ _NECK = 1.15
 _NECK_WINDOW = 3
 """Number of sections over which areas are averaged, because the area of a single section depends on the mesh."""
 _MIN_MASS, _MAX_BRANCH_MASS = 0.02, 0.3
-"""Minimum mass of a head above a neck, and maximum mass of a branch that is a part as a whole, as fractions of the body
-mass. The second excludes the trunk."""
+"""Minimum mass of a head, and maximum mass of a branch that counts as one part, as fractions of the body mass. The
+maximum excludes the trunk."""
 _BASE_HEIGHT = 0.06
 """Height in body heights below which a node belongs to the base."""
 _MIN_NODES = 4

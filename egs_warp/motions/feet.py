@@ -21,7 +21,8 @@ from egs_warp.motions.limbs import Limbs, Sections, find_limbs
 _SOLE_HEIGHT = 0.02
 """Height of the sole: nodes up to this height above the lowest node of a foot belong to it, in body heights."""
 _FOOT_HEIGHT = 0.1
-"""Height in body heights below which a foot is not distinguished from its leg."""
+"""Height in body heights of the lowest part of a body or leg, which counts as base or foot: junctions of legs below it
+are ignored."""
 _RIGID_FRACTION = 0.15
 """Fraction of a leg, from the ground up, that moves rigidly with the foot."""
 _LYING_RATIO = 3.0

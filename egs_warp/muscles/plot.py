@@ -38,7 +38,7 @@ def check_picture_name(path: Path) -> None:
         UserError: the ending does not belong to an image format, or the folder does not exist.
     """
     if path.suffix.lower() not in _EXTENSIONS:
-        raise UserError(f"{path}: not the name of an image; let it end in one of {', '.join(_EXTENSIONS)}")
+        raise UserError(f"{path}: not the name of an image; give a name that ends in one of {', '.join(_EXTENSIONS)}")
     if not path.parent.is_dir():
         raise UserError(f"{path}: its folder does not exist; create {path.parent} first")
 

@@ -215,7 +215,7 @@ def segment_scene(
     segmentation, method = located.segmentation, options.method
     straddling_cloud, ground = cloud.subset(segmentation.object_mask), located.ground
     if ground is not None:
-        # Flatten the ground to the plane, because only a plane can be cleared from the object.
+        # Flatten the ground to the plane, because ``clear_plane`` clears the object of a plane only.
         straddling_cloud, photographs = _moved(straddling_cloud, ground.flatten), None
     heights, reach = plane_extents(straddling_cloud, located.plane, options.clearing_options.reach)
     if not segmentation.background_mask.any():

@@ -115,8 +115,8 @@ def test_an_oblique_spinning_impact_obeys_coulombs_law() -> None:
 
 
 def test_dropped_body_comes_to_rest_without_gaining_energy() -> None:
-    """Eq. (4), Eq. (9): dropped from H/2 with muscles off, no step adds more than 1e-7 m g H,
-    and it ends at rest on its base.
+    """Eq. (4), Eq. (9): a body dropped from H/2 with muscles off gains at most 1e-7 m g H of energy in any step,
+    and ends at rest on its base.
     """
     falling = block(0.8, lift=0.5)
     body, gaps_of = falling.body, falling.solver.detector.gaps

@@ -104,7 +104,7 @@ def test_top_is_where_a_vertical_line_meets_the_ground() -> None:
 
 
 def test_coarser_ground_keeps_long_waves() -> None:
-    """Waves of 16 new spacings change by at most 3 % of their height; waves of two keep at most 35 %."""
+    """Waves 16 new spacings long change by at most 3 % of their amplitude; waves two long keep at most 35 % of it."""
     field = wavy_ground(0.03, spacing=0.02)
     coarse = field.coarser(0.05)
     assert coarse.spacing == 0.05 and len(coarse.coefficients) < 0.5 * len(field.coefficients)

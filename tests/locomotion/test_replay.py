@@ -178,7 +178,7 @@ def test_a_damaged_part_is_reported_and_can_be_left_out(cut_off: Path) -> None:
 
 
 def test_a_pushed_run_continues_and_another_push_is_refused(tmp_path: Path) -> None:
-    """The push is before the interruption; without it, the objectives of its step are the same."""
+    """The push precedes the interruption. It does not change the objectives of its step, so the digest includes it."""
     made = block()
 
     def pushed(size: float) -> Any:

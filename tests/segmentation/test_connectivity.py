@@ -32,7 +32,8 @@ def test_parts_and_insides() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_long_gaussian_reaches_its_ends(seed: int) -> None:
-    """A Gaussian of any orientation connects clusters 3.9 cells apart; a longer one reaches four cells."""
+    """A Gaussian of any orientation connects clusters 3.9 cells apart; the reach of a longer one is limited to four
+    cells."""
     random = np.random.default_rng(seed)
     turn = Rotation.from_quat(random.normal(size=4))
     way = turn.as_matrix()[:, seed]

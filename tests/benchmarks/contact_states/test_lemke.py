@@ -38,7 +38,7 @@ def test_closed_forms() -> None:
 
 
 def test_ties_terminate() -> None:
-    """Equal rows and a q of zeros or equal entries are ties; the lexicographic rule terminates nevertheless."""
+    """Equal rows of the matrix, and zero or equal entries of q, cause ties; the lexicographic rule still terminates."""
     matrix = np.ones((6, 6)) + np.kron(np.eye(3), np.ones((2, 2)))
     z = lemke(matrix, np.array([-1.0, -1.0, -1.0, -1.0, 0.0, 0.0]))
     assert z is not None
