@@ -204,7 +204,8 @@ def test_own_muscles_are_plotted(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_a_plot_needs_the_name_of_a_picture(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["muscles", str(tmp_path / "nothing.ply"), "--plot", str(tmp_path / name)]) == 2
     error = capsys.readouterr().err
-    assert f"{name}: not the name of an image; give a name that ends in one of .png, .jpg" in error and error.count("\n") == 1
+    message = f"{name}: not the name of an image; give a name that ends in one of .png, .jpg"
+    assert message in error and error.count("\n") == 1
 
 
 def test_a_plot_needs_an_existing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -57,8 +57,8 @@ def initial_cloud(
     candidates = np.flatnonzero(visibility.solid if visibility.solid.any() else visibility.often)
     if len(candidates) == 0:
         raise UserError("train: the cameras have no common view; check the poses")
-    # In empty space in front of a plain backdrop, the colour varies as little between the views as on a surface, so half
-    # of the points are chosen at random.
+    # In empty space in front of a plain backdrop, the colour varies as little between the views as on a surface, so
+    # half of the points are chosen at random.
     best = candidates[np.argsort(visibility.spread[candidates], kind="stable")][: count // 2]
     rest = random.permutation(np.setdiff1d(candidates, best))[: count - len(best)]
     chosen = np.concatenate([best, rest])

@@ -86,8 +86,8 @@ def read_views(posed: Path | str, *, max_side: int | None = None, inverted_masks
         raise UserError(f"{posed}: none of its {len(left_out)} photos can be used; the first: {left_out[0].reason}")
     masked = sum(view.alpha is not None for view in views)
     if masked:
-        # Where other photos are cut out by their alpha, an alpha channel that is opaque everywhere means that the object
-        # fills the photo.
+        # Where other photos are cut out by their alpha, an alpha channel that is opaque everywhere means that the
+        # object fills the photo.
         for number in opaque:
             image = views[number].image
             views[number] = replace(views[number], alpha=np.ones(image.shape[:2], np.float32))
