@@ -266,7 +266,7 @@ def simulate(
     trajectory = trajectory.with_plan(planned_com(sequence, creature.body, trajectory))
     simulation = replace(simulation, trajectory=trajectory)
     has_frame_count = frames is not None or activations is not None
-    return SimulatedRun(creature, place, sequence, simulation, watch.fallen, tuple(pushes), has_frame_count)
+    return SimulatedRun(creature, place, sequence, simulation, watch.fall_note, tuple(pushes), has_frame_count)
 
 
 def checked_activations(creature: Creature, activations: np.ndarray, step: float | None) -> np.ndarray:
