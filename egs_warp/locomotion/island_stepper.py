@@ -27,8 +27,20 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import Plan, StageClock
 from egs_warp.locomotion.prediction import predict_end
 from egs_warp.locomotion.step_cost import objectives_value
-from egs_warp.locomotion.stepper import MAX_HALVINGS, REPLAN_FACTOR, REPLAN_MARGIN, LocomotionStepper, StepReport, WarmStart
+from egs_warp.locomotion.stepper import (
+    MAX_HALVINGS,
+    REPLAN_FACTOR,
+    REPLAN_MARGIN,
+    LocomotionStepper,
+    StepReport,
+    WarmStart,
+)
 from egs_warp.muscles.tension import MuscleEnergy
+
+MAX_PAIR_DEPTH = 0.01
+"""Depth of one body in another, in body heights, beyond which a step that has increased it is repeated as half steps. The
+planes of contact are those at the start of the step, which is inaccurate where a body moves far over an edge.
+"""
 
 States, Memories, Objectives = Sequence[BodyState], Sequence[WarmStart], Sequence[Sequence[AnyObjective]]
 """State, warm start and objectives of each body."""
@@ -37,16 +49,25 @@ States, Memories, Objectives = Sequence[BodyState], Sequence[WarmStart], Sequenc
 class IslandStepper:
     """Stepper of the bodies of an island."""
 
-    def __init__(self, members: Sequence[int], steppers: Sequence[LocomotionStepper], pairs: PairContactDetector) -> None:
+    def __init__(
+        self,
+        members: Sequence[int],
+        steppers: Sequence[LocomotionStepper],
+        pairs: PairContactDetector,
+        frictions: np.ndarray,
+    ) -> None:
         """Make the stepper of some bodies of a world.
 
         Args:
             members: indices of the bodies in the world, ascending.
-            steppers: stepper of each of them.
+            steppers: stepper of each of the k bodies.
             pairs: contact between them.
+            frictions: (k, k) Coulomb coefficients between them.
         """
         self.members, self.steppers = tuple(members), tuple(steppers)
-        self.contacts = IslandContacts(tuple(stepper.detector for stepper in steppers), pairs)
+        with_ground = np.array([[stepper.geometry.friction] for stepper in steppers])
+        detectors = tuple(stepper.detector for stepper in steppers)
+        self.contacts = IslandContacts(detectors, pairs, np.hstack([frictions, with_ground]))
         self.solver = IslandSolver(
             steppers[0].detector,
             steppers[0].selector,
@@ -60,14 +81,14 @@ class IslandStepper:
     def _factors(self) -> tuple[object, ...]:
         return tuple(stepper.factors for stepper in self.steppers)
 
-    def advance(
-        self, states: States, memories: Memories, objectives: Objectives, dt: float
-    ) -> list[list[StepReport]]:
-        """Make one step of ``dt`` s; if it does not converge, repeat it as half steps. See ``WorldStepper.advance`` and
-        ``LocomotionStepper.advance``."""
+    def advance(self, states: States, memories: Memories, objectives: Objectives, dt: float) -> list[list[StepReport]]:
+        """Make one step of ``dt`` s; if it does not converge, or if bodies penetrate too far, repeat it as half steps.
+        See ``WorldStepper.advance`` and ``LocomotionStepper.advance``."""
         reports = self._step(states, memories, objectives, None, dt)
         if reports[0].converged:
-            return [[report] for report in reports]
+            if not self._is_too_deep(reports, states):
+                return [[report] for report in reports]
+            return self._half_steps(states, memories, [r.activations for r in reports], dt, MAX_HALVINGS)
         candidates = [
             self._half_steps(states, memories, activations, dt, MAX_HALVINGS)
             for activations in ([r.activations for r in reports], [memory.activations for memory in memories])
@@ -81,8 +102,9 @@ class IslandStepper:
         to ``max_halvings`` - 1 times."""
         done: list[list[StepReport]] = [[] for _ in self.steppers]
         for _ in range(2):
-            reports = [[r] for r in self._step(states, memories, [()] * len(states), activations, 0.5 * dt)]
-            if not reports[0][0].converged and max_halvings > 1:
+            ends = self._step(states, memories, [()] * len(states), activations, 0.5 * dt)
+            reports = [[end] for end in ends]
+            if max_halvings > 1 and (not ends[0].converged or self._is_too_deep(ends, states)):
                 reports = self._half_steps(states, memories, activations, 0.5 * dt, max_halvings - 1)
             for before, after in zip(done, reports, strict=True):
                 before += after
@@ -90,9 +112,16 @@ class IslandStepper:
             memories = [WarmStart.from_report(each[-1]) for each in done]
         return done
 
-    def _rank(
-        self, done: Sequence[Sequence[StepReport]], states: States, objectives: Objectives
-    ) -> tuple[bool, float]:
+    def _is_too_deep(self, ends: Sequence[StepReport], states: States) -> bool:
+        """Return True if a step from ``states`` has pushed a body too deep into another or into the ground."""
+        height = min(stepper.body.height for stepper in self.steppers)
+        end, limit = np.array([report.min_gap for report in ends]), -MAX_PAIR_DEPTH * height
+        if end.min() >= limit:
+            return False
+        start = self.contacts.min_gaps(np.concatenate([state.positions for state in states]))
+        return bool(((end < limit) & (end < start)).any())
+
+    def _rank(self, done: Sequence[Sequence[StepReport]], states: States, objectives: Objectives) -> tuple[bool, float]:
         """Return the sort key of half steps; see ``LocomotionStepper.advance``."""
         value = 0.0
         for stepper, reports, state, targets in zip(self.steppers, done, states, objectives, strict=True):
@@ -146,9 +175,10 @@ class IslandStepper:
         previous, forces = self._previous_contacts(memories)
         numbers = self.contacts.select(previous, forces[:, 0] > 0.0, problem.ballistic_positions)
         contacts = self.contacts.contact_set(numbers, problem.state.positions)
-        friction = self.steppers[0].geometry.friction
-        bias, forces = self.solver.normal_bias(contacts, dt), contacts.transferred_forces(previous, forces)
-        return StepInputs(problem, contacts, bias, friction, np.zeros(0), forces)
+        forces = contacts.transferred_forces(previous, forces)
+        forces = forces / self.contacts.tangent_lengths(self.contacts.pairs.keys(numbers))
+        bias = self.solver.normal_bias(contacts, dt)
+        return StepInputs(problem, contacts, bias, self.contacts.friction, np.zeros(0), forces)
 
     def _previous_contacts(self, memories: Memories) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers (m,) and forces (m, 3) N of the contacts of the previous step."""
@@ -200,7 +230,8 @@ class IslandStepper:
             own = replace(
                 predicted, activations=plans[body].activations, forces=forces, body=body, other_tensions=tensions
             )
-            plans[body] = stepper.planner.plan(own, memories[body].activations, objectives[body], clock)
+            planner = replace(stepper.planner, friction=self.contacts.friction)
+            plans[body] = planner.plan(own, memories[body].activations, objectives[body], clock)
             forces = plans[body].forces
             # The end that the last plan expects is the end that all plans expect together.
             plans = [replace(plan, velocities=plans[body].velocities, forces=forces) for plan in plans]
@@ -247,7 +278,9 @@ class IslandStepper:
         parts = zip(problem.problems, problem.split(end.velocities), pushes, objectives, strict=True)
         return np.array(
             [
-                objectives_value(own, contacts.with_nodes_of(problem.nodes_of(body)), targets, ends, push, own.body.speed_unit)
+                objectives_value(
+                    own, contacts.with_nodes_of(problem.nodes_of(body)), targets, ends, push, own.body.speed_unit
+                )
                 for body, (own, ends, push, targets) in enumerate(parts)
             ]
         )
@@ -258,6 +291,9 @@ class IslandStepper:
         """Return the report of each body at the end of a solve."""
         contacts, ends = result.contacts, problem.end_positions(result.velocities)
         keys, end_gaps = self.contacts.pairs.keys(contacts.points), contacts.end_gaps(problem.dt, result.velocities)
+        lengths = self.contacts.tangent_lengths(keys)
+        contacts = replace(contacts, axes=contacts.axes / lengths[:, :, None])
+        forces = result.forces * lengths
         min_gaps, tensions = self.contacts.min_gaps(ends), self._tensions([plan.activations for plan in plans])
         clock.lap("report")
         reports = []
@@ -272,7 +308,7 @@ class IslandStepper:
                     state=BodyState(end, velocities, own.state.time + problem.dt),
                     dt=problem.dt,
                     contacts=own_contacts,
-                    forces=result.forces[chosen],
+                    forces=forces[chosen],
                     end_gaps=end_gaps[chosen],
                     min_gap=float(min_gaps[body]),
                     activations=plan.activations,

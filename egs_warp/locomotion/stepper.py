@@ -226,6 +226,8 @@ class LocomotionStepper:
         Returns:
             State at the end, warm start of the next step, and the report of each step that was made, in order.
         """
+        if self.muscles.segment_count == 0:
+            return self.advance_with_activations(state, memory, memory.activations, dt)
         with one_blas_thread(), self.factors.stream:
             end, after, report = self.step(state, memory, objectives, dt)
             if report.converged:

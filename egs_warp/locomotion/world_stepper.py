@@ -40,8 +40,18 @@ class WorldBody:
 class WorldStepper:
     """Stepper of the bodies of one world."""
 
-    def __init__(self, bodies: Sequence[WorldBody]) -> None:
+    def __init__(self, bodies: Sequence[WorldBody], *, frictions: np.ndarray | None = None) -> None:
+        """Make the stepper of k bodies.
+
+        Args:
+            bodies: the bodies; the Coulomb coefficient of each with the ground is that of its contact geometry.
+            frictions: (k, k) Coulomb coefficients between the bodies, symmetric; None takes the geometric mean of their
+                coefficients with the ground.
+        """
         self.bodies = tuple(bodies)
+        with_ground = np.array([body.stepper.geometry.friction for body in bodies])
+        self.frictions = np.sqrt(np.outer(with_ground, with_ground)) if frictions is None else np.asarray(frictions)
+        """(k, k) Coulomb coefficients between the bodies."""
         self.pairs = PairContactDetector(
             [
                 PairBody(body.stepper.geometry, body.stepper.selector, body.level_set, body.rest_positions)
@@ -104,7 +114,9 @@ class WorldStepper:
     def _island(self, members: tuple[int, ...]) -> IslandStepper:
         if members not in self._islands:
             steppers = [self.bodies[i].stepper for i in members]
-            self._islands[members] = IslandStepper(members, steppers, self.pairs.subset(members))
+            self._islands[members] = IslandStepper(
+                members, steppers, self.pairs.subset(members), self.frictions[np.ix_(members, members)]
+            )
         return self._islands[members]
 
 
