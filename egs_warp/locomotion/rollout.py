@@ -134,7 +134,8 @@ class BodyRun:
         return self.state.with_velocity_kick(self._kick), done
 
     def finish_step(self, done: Sequence[StepReport]) -> None:
-        """Continue from the end of the step, and record ``done``, the reports of the parts into which it was divided."""
+        """Continue from the end of the step, and record ``done``, the reports of the parts into which it was
+        divided."""
         self.state, self.memory = done[-1].state, WarmStart.from_report(done[-1])
         self.reports.extend(done)
         self._recorder.add(done, request_digest=self._digest, kick=self._kick)

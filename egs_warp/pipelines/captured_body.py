@@ -17,10 +17,12 @@ from scipy.spatial.transform import Rotation
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.contact.terrain import Surface
 from egs_warp.deformation.rigid import to_body_frame
+from egs_warp.errors import ArgumentError
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.meshing.level_set import MAX_CELLS, LevelSet, level_set_of_body
 from egs_warp.meshing.occupancy import LatticeSolid, solid_from_gaussians
@@ -88,6 +90,16 @@ class CapturedBody:
             return self
         return self._moved(turn, shift)
 
+    def with_friction(self, friction: float) -> Self:
+        """Return the same body at rest on ground with another Coulomb coefficient.
+
+        Raises ``ArgumentError`` for a negative one.
+        """
+        old = self.stepper
+        geometry, device = replace(old.geometry, friction=checked_friction(friction)), str(old.body.assembly.device)
+        stepper = LocomotionStepper(old.body, old.muscles, geometry, settings=old.settings, device=device)
+        return replace(self, stepper=stepper, start=settle(stepper))
+
     def _moved(self, turn: np.ndarray, shift: np.ndarray) -> Self:
         """Return the body after the rotation ``turn`` (3, 3) and the translation ``shift`` (3,) m."""
         start, frame = self.start, self.frame
@@ -123,3 +135,10 @@ def points_at_rest(geometry: ContactGeometry) -> np.ndarray:
     """Return the contact points (P, 3) m of ``geometry`` in the rest shape."""
     mesh = geometry.mesh
     return np.einsum("pw,pwi->pi", geometry.weights, mesh.nodes[mesh.tets[geometry.tet_from_point]])
+
+
+def checked_friction(friction: float) -> float:
+    """Return the Coulomb coefficient ``friction``. Raises ``ArgumentError`` if it is negative or not finite."""
+    if not 0.0 <= friction < np.inf:
+        raise ArgumentError("friction", "give a Coulomb coefficient of at least 0", value=friction)
+    return friction

@@ -123,16 +123,6 @@ class Creature(CapturedBody):
     overlap: float = 0.0
     """Softness of the parts that stick out (``CreatureOptions``)."""
 
-    def with_friction(self, friction: float) -> Creature:
-        """Return the same body at rest on ground with another Coulomb coefficient.
-
-        Raises ``ArgumentError`` for a negative one.
-        """
-        old = self.stepper
-        geometry, device = replace(old.geometry, friction=checked_friction(friction)), str(old.body.assembly.device)
-        stepper = LocomotionStepper(old.body, old.muscles, geometry, settings=old.settings, device=device)
-        return replace(self, stepper=stepper, start=settle(stepper))
-
     def _moved(self, turn: np.ndarray, shift: np.ndarray) -> Creature:
         front = self.front
         alternative = None if front.alternative is None else turn @ front.alternative
@@ -370,13 +360,6 @@ def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
     gaps, _ = stepper.detector.gaps(start.positions)
     upright = np.trace(turn) > 1.0 + 2.0 * np.cos(np.radians(10.0))
     return bool(np.linalg.norm(moved) < 0.04 * body.height and upright and gaps.min() > -0.01 * body.height)
-
-
-def checked_friction(friction: float) -> float:
-    """Return the Coulomb coefficient ``friction``. Raises ``ArgumentError`` if it is negative or not finite."""
-    if not 0.0 <= friction < np.inf:
-        raise ArgumentError("friction", "give a Coulomb coefficient of at least 0", value=friction)
-    return friction
 
 
 def initial_stance(creature: Creature, *, step: float | None = None, style: Style | None = None) -> Stance:

@@ -105,7 +105,7 @@ def _height(shape: CapturedShape) -> float:
 
 
 def embedded_in(mesh: TetMesh, geometry: ContactGeometry) -> ContactGeometry:
-    """Return all contact points of ``geometry`` in a ``mesh`` of one tetrahedron, which extrapolates to them exactly."""
+    """Return all contact points of ``geometry`` in a ``mesh`` of one tetrahedron, which extrapolates exactly."""
     points = points_at_rest(geometry)
     corners = np.vstack([mesh.nodes[mesh.tets[0]].T, np.ones(4)])
     weights = np.linalg.solve(corners, np.vstack([points.T, np.ones(len(points))])).T
