@@ -19,6 +19,7 @@ from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
 from egs_warp.contact.newton_round import run_round
 from egs_warp.contact.selection import ACTIVATION_DEPTH, ContactSelector
 from egs_warp.fem.implicit_step import ImplicitStep
+from egs_warp.fem.island_problem import IslandProblem
 from egs_warp.kernels.contact.newton_convergence import ACCEPTED, ENDED
 from egs_warp.muscles.tension import MuscleEnergy
 
@@ -90,9 +91,9 @@ class NewtonOptions:
         speeds = push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT_FRACTION, tolerance)
         return speeds if contacts.counts is None else speeds * contacts.valid
 
-    def progress(self, problem: ImplicitStep, *, last: bool = False) -> NewtonProgress:
+    def progress(self, problem: ImplicitStep | IslandProblem, *, last: bool = False) -> NewtonProgress:
         """Return the progress at the start of a round. In the ``last`` round no points are added."""
-        coulomb_tolerance = COULOMB_TOLERANCE * problem.residual_scale / problem.body.mass
+        coulomb_tolerance = COULOMB_TOLERANCE * problem.free_fall_speed
         return NewtonProgress(self.tolerance, -1.0 if last else ACTIVATION_RESIDUAL, coulomb_tolerance)
 
 
