@@ -140,7 +140,8 @@ class World:
 
     def stepper(self) -> WorldStepper:
         """Return the stepper of all bodies. The first call for a body computes its level set, which takes seconds."""
-        return WorldStepper([WorldBody(member.body.stepper, member.body.shape.level_set) for member in self.members])
+        bodies = [member.body for member in self.members]
+        return WorldStepper([WorldBody(body.stepper, body.shape.level_set, body.mesh.nodes) for body in bodies])
 
     def _check_name(self, name: str) -> None:
         if not name or not all(letter.isalnum() or letter in "-_" for letter in name):
