@@ -47,10 +47,16 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.job import Job
     from egs_warp.pipelines.many import JobResult, simulate_many
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
+    from egs_warp.pipelines.prop import Prop, make_prop
     from egs_warp.pipelines.report import Report
     from egs_warp.pipelines.shot import Shot
-    from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
+    from egs_warp.pipelines.simulated_run import SimulatedRun
+    from egs_warp.pipelines.simulation import simulate
     from egs_warp.pipelines.train_capture import TrainResult, train
+    from egs_warp.pipelines.world import PlacedBody, World
+    from egs_warp.pipelines.world_file import read_world
+    from egs_warp.pipelines.world_film import film_world
+    from egs_warp.pipelines.world_run import PropRun, WorldRun
     from egs_warp.render.autograd import render_torch
     from egs_warp.render.rasteriser import render_gaussians
     from egs_warp.segmentation.clearance import ExtentMeasure, StraddlingOptions, StraddlingPolicy
@@ -103,11 +109,17 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "pipelines.creature": ("Creature", "CreatureOptions", "make_creature"),
     "pipelines.job": ("Job",),
     "pipelines.many": ("JobResult", "simulate_many"),
-    "pipelines.simulated_run": ("SimulatedRun", "simulate"),
+    "pipelines.simulated_run": ("SimulatedRun",),
+    "pipelines.simulation": ("simulate",),
     "pipelines.prepare_scene": ("PreparedScene", "SceneOptions", "prepare_scene"),
+    "pipelines.prop": ("Prop", "make_prop"),
     "pipelines.report": ("Report",),
     "pipelines.shot": ("Shot",),
     "pipelines.train_capture": ("TrainResult", "train"),
+    "pipelines.world": ("PlacedBody", "World"),
+    "pipelines.world_file": ("read_world",),
+    "pipelines.world_film": ("film_world",),
+    "pipelines.world_run": ("PropRun", "WorldRun"),
     "render.autograd": ("render_torch",),
     "render.rasteriser": ("render_gaussians",),
     "segmentation.clearance": ("StraddlingPolicy", "StraddlingOptions", "ExtentMeasure"),
@@ -156,8 +168,11 @@ __all__ = [
     "MainLight",
     "MaskedView",
     "ObjectSpec",
+    "PlacedBody",
     "Plane",
     "PreparedScene",
+    "Prop",
+    "PropRun",
     "Push",
     "Quantity",
     "Report",
@@ -177,6 +192,8 @@ __all__ = [
     "Trajectory",
     "UserError",
     "VideoWriter",
+    "World",
+    "WorldRun",
     "__version__",
     "animate",
     "click_at",
@@ -184,12 +201,14 @@ __all__ = [
     "contact_sheet",
     "drive_script",
     "embed_gaussians",
+    "film_world",
     "finetune",
     "footprint",
     "inpaint",
     "inpainter_by_name",
     "keyframe_script",
     "make_creature",
+    "make_prop",
     "motion",
     "one_line_errors",
     "own_script",
@@ -199,6 +218,7 @@ __all__ = [
     "read_capture",
     "read_pushes",
     "read_style",
+    "read_world",
     "render_gaussians",
     "render_torch",
     "render_views",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Protocol, TypeAlias
@@ -27,6 +27,8 @@ FRAME_RATE = 60
 """Frame rate of a video, 1/s."""
 REST_FRAMES = 20
 """Number of frames for which a run continues after the motion has finished."""
+_MIN_SUPPORT_COSINE = 0.7
+"""Cosine of the angle between the normal of a contact and the vertical, above which another body supports the body."""
 
 
 Kicks: TypeAlias = Callable[[float, float], np.ndarray | None]
@@ -88,6 +90,7 @@ class BodyRun:
     ) -> None:
         """Begin at ``start``; the arguments are described at ``roll_out``."""
         self.stepper, self._motion, self._kicks = stepper, motion, kicks
+        self._up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
         self.state, self.memory = start, stepper.initial_memory()
         self.reports: list[StepReport] = []
         self._shown = [0]
@@ -112,7 +115,8 @@ class BodyRun:
     def objectives(self, dt: float) -> Sequence[AnyObjective]:
         """Return the objectives of the motion for the next step of ``dt`` s."""
         with one_blas_thread():
-            return self._motion.objectives(self.state, self.reports[-1] if self.reports else None, dt)
+            report = _without_pushes(self.reports[-1], self._up) if self.reports else None
+            return self._motion.objectives(self.state, report, dt)
 
     def begin_step(
         self, objectives: Sequence[AnyObjective], dt: float, activations: np.ndarray | None = None
@@ -218,6 +222,21 @@ def roll_out(
         if stopped or resting == REST_FRAMES or aborted():
             break
     return run.result(stopped=stopped)
+
+
+def _without_pushes(report: StepReport, up: np.ndarray) -> StepReport:
+    """Return ``report`` without the contacts with other bodies that do not support the body against gravity, which is
+    opposite to ``up`` (3,): a motion must not take the body that pushes it for its ground."""
+    contacts = report.contacts
+    kept = (contacts.faces >= 0) | (contacts.axes[:, 0] @ up > _MIN_SUPPORT_COSINE)
+    if kept.all():
+        return report
+    return replace(
+        report,
+        contacts=replace(contacts, **{name: value[kept] for name, value in contacts.batched_fields()}),
+        forces=report.forces[kept],
+        end_gaps=report.end_gaps[kept],
+    )
 
 
 def _try_advance(advance: Callable[[], tuple[BodyState, WarmStart, list[StepReport]]]) -> list[StepReport]:

@@ -79,7 +79,8 @@ def check_trajectory(t: Trajectory) -> None:
         if name in _POSITIVE and not (values > 0.0).all():
             raise ValueError(f"{name} is not positive")
     for name, below in _INDICES.items():
-        values = getattr(t, name)
+        # A negative plane is another body.
+        values = np.maximum(t.contact_plane, 0) if name == "contact_plane" else getattr(t, name)
         if values.dtype.kind not in "iu" or (values.size and not 0 <= values.min() <= values.max() < extents[below]):
             raise ValueError(f"{name} has an index out of range")
     starts = t.muscle_end_starts

@@ -38,6 +38,7 @@ from egs_warp.pipelines.facing_direction import Front
 from egs_warp.pipelines.placed_cage import (
     PlacedCage,
     check_front,
+    check_height,
     choose_front,
     estimated_up,
     place_cage,
@@ -68,7 +69,9 @@ class CreatureOptions:
     """Options of ``make_creature``; vectors, planes and surfaces are in the frame and units of the capture."""
 
     metres_per_unit: float | None = None
-    """Length of one unit of the capture, m; None makes the body 1 m tall."""
+    """Length of one unit of the capture, m; None uses ``height``."""
+    height: float | None = None
+    """Height of the body, m; None makes it 1 m tall."""
     sag: float = DEFAULT_SAG
     """Fraction of the body height by which the body sags under its weight; it defines the stiffness. The stiffness is
     increased if the weight would bend the body out of shape."""
@@ -108,6 +111,7 @@ class CreatureOptions:
             # The bounds keep lengths within the range of single precision; ``make_body`` checks the height of the body.
             advice = "give a positive number, from 1e-9 to 1e9"
             raise ArgumentError("metres_per_unit", advice, value=self.metres_per_unit)
+        check_height(self.height, self.metres_per_unit)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -180,6 +184,7 @@ def make_creature(
         up=up,
         plane=plane,
         metres_per_unit=options.metres_per_unit,
+        height=options.height,
         nodes=options.nodes,
         cage_file=options.cage_file,
     )

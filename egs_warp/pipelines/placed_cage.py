@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import ArgumentError
+from egs_warp.fem.body import MAX_HEIGHT, MIN_HEIGHT
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
@@ -97,6 +98,7 @@ def place_cage(
     up: np.ndarray | None = None,
     plane: Plane | None = None,
     metres_per_unit: float | None = None,
+    height: float | None = None,
     nodes: int = 500,
     cage_file: Path | None = None,
 ) -> PlacedCage:
@@ -106,7 +108,8 @@ def place_cage(
         cloud: The capture.
         up: (3,) Up in the capture; if there is no ``plane``, the ground is the object's base, orthogonal to ``up``.
         plane: Ground plane in the capture.
-        metres_per_unit: Length of one unit of the capture, m; None makes the body 1 m tall.
+        metres_per_unit: Length of one unit of the capture, m; None uses ``height``.
+        height: Height of the body, m; None makes it 1 m tall.
         nodes: Approximate number of cage nodes.
         cage_file: File with the tetrahedra of the cage (``read_cage_mesh``); None generates them.
     """
@@ -123,7 +126,7 @@ def place_cage(
         cage = cage_of_body(gaussians, target_nodes=nodes, solid=solid)
     else:
         cage = cage_of_mesh(gaussians, read_cage_in(cage_file, frame.moved(anchor)), solid)
-    metres = 1.0 / cage.height(GROUND) if metres_per_unit is None else metres_per_unit / frame.scale
+    metres = (height or 1.0) / cage.height(GROUND) if metres_per_unit is None else metres_per_unit / frame.scale
     cage = _rounded(cage.scaled(metres))
     limbs = find_limbs(Sections.of_solid(solid.scaled(metres), cage.mesh), cage.mesh.nodes)
     return PlacedCage(frame.moved(anchor).scaled(metres), gaussians.scaled(metres), cage, limbs)
@@ -162,3 +165,13 @@ def check_front(up: np.ndarray, front: np.ndarray) -> None:
     if np.linalg.norm(np.cross(front, up)) < 1e-3 * np.linalg.norm(front) * np.linalg.norm(up):
         given = ",".join(f"{x:g}" for x in front)
         raise ArgumentError("front", "points up or down; give a direction along the ground", value=given)
+
+
+def check_height(height: float | None, metres_per_unit: float | None) -> None:
+    """Raise ``ArgumentError`` for an invalid ``height`` of a body in metres, or one beside ``metres_per_unit``."""
+    if height is None:
+        return
+    if metres_per_unit is not None:
+        raise ArgumentError("height", "metres_per_unit defines the size, too; give one of them", value=height)
+    if not MIN_HEIGHT <= height <= MAX_HEIGHT:
+        raise ArgumentError("height", f"give metres from {MIN_HEIGHT:g} to {MAX_HEIGHT:g}", value=height)

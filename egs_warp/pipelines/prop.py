@@ -23,7 +23,7 @@ from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, points_at_rest
-from egs_warp.pipelines.placed_cage import estimated_up, place_cage, simulation_device
+from egs_warp.pipelines.placed_cage import check_height, estimated_up, place_cage, simulation_device
 
 MIN_DENSITY, MAX_DENSITY = 1.0, 30_000.0
 """Minimum and maximum density of a prop, kg/m^3; other values are rejected as a probable mistake in the units."""
@@ -44,6 +44,7 @@ def make_prop(
     up: Direction | None = None,
     plane: Plane | None = None,
     metres_per_unit: float | None = None,
+    height: float | None = None,
     density: float = 1000.0,
     friction: float = 0.8,
     settings: LocomotionSettings | None = None,
@@ -56,7 +57,8 @@ def make_prop(
         up: (3,) Up direction in the capture, or an axis such as ``"-y"``; None uses the up direction of the file or
             estimates it, as ``make_creature`` does.
         plane: Ground plane in the capture; None uses the base of the object, orthogonal to ``up``.
-        metres_per_unit: Length of one unit of the capture, m; None makes the prop 1 m tall.
+        metres_per_unit: Length of one unit of the capture, m; None uses ``height``.
+        height: Height of the prop, m; None makes it 1 m tall.
         density: Density, kg/m^3.
         friction: Coulomb coefficient of the ground.
         settings: Contact settings; None uses the default.
@@ -68,13 +70,14 @@ def make_prop(
     check_cloud(cloud)
     if not MIN_DENSITY <= density <= MAX_DENSITY:
         raise ArgumentError("density", f"give kg/m^3 from {MIN_DENSITY:g} to {MAX_DENSITY:g}", value=density)
+    check_height(height, metres_per_unit)
     notes: tuple[str, ...] = ()
     up = None if up is None else direction_of(up, "up")
     if plane is None and up is None:
         up, note = estimated_up(cloud, advice="give up")
         notes = (note,)
     progress("cage")
-    standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, nodes=_CAGE_NODES)
+    standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, height=height, nodes=_CAGE_NODES)
     device, mesh = simulation_device(cloud), standing.cage.mesh
     progress("contact")
     grid = _CONTACT_GRID * standing.cage.height(GROUND)

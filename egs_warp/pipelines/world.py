@@ -30,7 +30,7 @@ Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, eq=False)
-class Member:
+class PlacedBody:
     """A body of a world at its place, as ``World.add`` returns it."""
 
     __repr__ = short_repr
@@ -59,13 +59,13 @@ class World:
         """
         self.solids = tuple(solids)
         self.friction = None if friction is None else checked_friction(friction)
-        self._members: dict[str, Member] = {}
+        self._members: dict[str, PlacedBody] = {}
 
     def __repr__(self) -> str:
         return f"World({', '.join(self._members) or 'empty'})"
 
     @property
-    def members(self) -> tuple[Member, ...]:
+    def members(self) -> tuple[PlacedBody, ...]:
         """The bodies in the order in which they were added."""
         return tuple(self._members.values())
 
@@ -74,22 +74,22 @@ class World:
         body: Creature | Prop,
         *,
         at: tuple[float, float] = (0.0, 0.0),
-        height: float = 0.0,
+        above: float = 0.0,
         heading: float | None = None,
         name: str | None = None,
-    ) -> Member:
+    ) -> PlacedBody:
         """Place a body on the ground.
 
         Args:
             body: A creature or a prop on level ground without solids of its own. The same body may be added repeatedly.
             at: Position of the origin of the body's frame, m.
-            height: Height above the ground or the solid below, m; a body above 0 falls.
+            above: Height above the ground or the solid below, m; above 0, the body falls.
             heading: Direction in which a creature faces, degrees counter-clockwise from the x axis of the world, seen
                 from above. A prop is turned by this angle. None keeps the orientation of the body's own frame.
             name: Name for messages and files; None numbers the bodies: ``creature-1``, ``prop-2``.
 
         Returns:
-            The member by which ``simulate`` and its result name the body.
+            The placed body by which ``simulate`` and its result name the body.
 
         Raises:
             UserError: The name is taken, the body has its own terrain, or it overlaps a solid or another body.
@@ -97,11 +97,11 @@ class World:
         kind = "prop" if isinstance(body, Prop) else "creature"
         name = f"{kind}-{len(self._members) + 1}" if name is None else name
         self._check_name(name)
-        numbers = [*at, height, heading or 0.0]
+        numbers = [*at, above, heading or 0.0]
         # Not "any above the maximum", because NaN must be rejected, too.
-        if not np.abs(numbers).max() <= _MAX_POSITION or height < 0.0:
-            given = f"at {at[0]:g}, {at[1]:g}, height {height:g}, heading {heading or 0.0:g}"
-            raise UserError(f"{name}: {given}: give finite numbers up to {_MAX_POSITION:g}, and a height of at least 0")
+        if not np.abs(numbers).max() <= _MAX_POSITION or above < 0.0:
+            given = f"at {at[0]:g}, {at[1]:g}, above {above:g}, heading {heading or 0.0:g}"
+            raise UserError(f"{name}: {given}: give finite numbers up to {_MAX_POSITION:g}, and above of at least 0")
         geometry, gravity = body.geometry, body.body.gravity
         if geometry.field is not None or len(geometry.planes) > 1 or np.abs(gravity[:2]).max() > 0.0:
             raise UserError(f"{name}: its ground is not a level plane; make it without ground, gravity_up and solids")
@@ -111,20 +111,20 @@ class World:
         surfaces = (Solid((GROUND,)), *self.solids)
         lift = surface_above(surfaces, point, GROUND.normal)
         captured_heading = _heading_of(body) if isinstance(body, Creature) else 0.0
-        placed = body.moved((*at, lift + height), 0.0 if heading is None else heading - captured_heading)
+        placed = body.moved((*at, lift + above), 0.0 if heading is None else heading - captured_heading)
         placed = replace(placed, stepper=self._own_stepper(placed), solids=surfaces)
-        member = Member(name, placed)
+        member = PlacedBody(name, placed)
         self._check_place(member)
         for other in self._members.values():
             check_apart(other, member)
         self._members[name] = member
         return member
 
-    def member(self, name: str) -> Member:
+    def member(self, name: str) -> PlacedBody:
         """Return the body ``name``."""
         return self._members[name]
 
-    def by_name(self, values: Mapping[Member | str, Value], what: str) -> dict[str, Value]:
+    def by_name(self, values: Mapping[PlacedBody | str, Value], what: str) -> dict[str, Value]:
         """Return ``values`` by the names of the bodies. Raises ``UserError``, which names ``what`` is given, for a
         body that is not in the world."""
         named: dict[str, Value] = {}
@@ -166,7 +166,7 @@ class World:
         is_taken = any(member.body.stepper is old for member in self._members.values())
         return deepcopy(old) if is_taken else old
 
-    def _check_place(self, member: Member) -> None:
+    def _check_place(self, member: PlacedBody) -> None:
         """Raise ``UserError`` if a body is inside a solid of the world."""
         body = member.body
         detector: ContactDetector = body.stepper.detector
@@ -178,7 +178,7 @@ class World:
             raise UserError(f"{member.name}: it is {-gaps[deepest]:.2g} m inside {what} at {_where(member)}; move one")
 
 
-def check_apart(first: Member, second: Member) -> None:
+def check_apart(first: PlacedBody, second: PlacedBody) -> None:
     """Raise ``UserError`` if two bodies overlap at the start: a contact point of one is inside the level set of the
     other."""
     depth = max(_depth(first.body, second.body), _depth(second.body, first.body))
@@ -213,6 +213,6 @@ def _heading_of(creature: Creature) -> float:
     return float(np.degrees(np.arctan2(y, x)))
 
 
-def _where(member: Member) -> str:
+def _where(member: PlacedBody) -> str:
     x, y, _ = member.body.body.centre_of_mass(member.body.start.positions)
     return f"({x:.2f}, {y:.2f})"

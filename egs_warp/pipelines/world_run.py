@@ -23,7 +23,7 @@ from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.end_state import EndCause
 from egs_warp.pipelines.prop import Prop
 from egs_warp.pipelines.simulated_run import BodyResult, Performer, SimulatedRun, check_frames
-from egs_warp.pipelines.world import Member, World
+from egs_warp.pipelines.world import PlacedBody, World
 from egs_warp.short_repr import short_repr
 
 STANDING = "stand"
@@ -79,7 +79,7 @@ class WorldRun:
     def __repr__(self) -> str:
         return f"WorldRun({', '.join(f'{name}: {run!r}' for name, run in self.bodies.items())})"
 
-    def __getitem__(self, member: Member | str) -> SimulatedRun | PropRun:
+    def __getitem__(self, member: PlacedBody | str) -> SimulatedRun | PropRun:
         """Return the result of one body."""
         return self.bodies[member if isinstance(member, str) else member.name]
 
@@ -117,13 +117,13 @@ class PassiveMotion:
 
 def simulate_world(
     world: World,
-    motions: Mapping[Member | str, Script | str],
+    motions: Mapping[PlacedBody | str, Script | str],
     *,
     frames: int | None = None,
     max_seconds: float | None = None,
     step: float | None = None,
     style: Style | None = None,
-    pushes: Mapping[Member | str, Sequence[Push]] | None = None,
+    pushes: Mapping[PlacedBody | str, Sequence[Push]] | None = None,
     get_up: bool = True,
     progress: Callable[[int, int], object] = lambda done, expected: None,
 ) -> WorldRun:
