@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from egs_warp.motions.sequence import BodyMotion
     from egs_warp.motions.style import Style, read_style
     from egs_warp.pipelines.animate import AnimateOptions, animate
+    from egs_warp.pipelines.animate_world import WorldReport, write_world
     from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
     from egs_warp.pipelines.job import Job
     from egs_warp.pipelines.many import JobResult, simulate_many
@@ -54,8 +55,7 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.simulation import simulate
     from egs_warp.pipelines.train_capture import TrainResult, train
     from egs_warp.pipelines.world import PlacedBody, World
-    from egs_warp.pipelines.world_file import read_world
-    from egs_warp.pipelines.world_film import film_world
+    from egs_warp.pipelines.world_file import WorldScript, read_world
     from egs_warp.pipelines.world_run import PropRun, WorldRun
     from egs_warp.render.autograd import render_torch
     from egs_warp.render.rasteriser import render_gaussians
@@ -106,6 +106,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "motions.sequence": ("BodyMotion",),
     "motions.style": ("Style", "read_style"),
     "pipelines.animate": ("AnimateOptions", "animate"),
+    "pipelines.animate_world": ("WorldReport", "write_world"),
     "pipelines.creature": ("Creature", "CreatureOptions", "make_creature"),
     "pipelines.job": ("Job",),
     "pipelines.many": ("JobResult", "simulate_many"),
@@ -117,8 +118,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "pipelines.shot": ("Shot",),
     "pipelines.train_capture": ("TrainResult", "train"),
     "pipelines.world": ("PlacedBody", "World"),
-    "pipelines.world_file": ("read_world",),
-    "pipelines.world_film": ("film_world",),
+    "pipelines.world_file": ("WorldScript", "read_world"),
     "pipelines.world_run": ("PropRun", "WorldRun"),
     "render.autograd": ("render_torch",),
     "render.rasteriser": ("render_gaussians",),
@@ -193,7 +193,9 @@ __all__ = [
     "UserError",
     "VideoWriter",
     "World",
+    "WorldReport",
     "WorldRun",
+    "WorldScript",
     "__version__",
     "animate",
     "click_at",
@@ -201,7 +203,6 @@ __all__ = [
     "contact_sheet",
     "drive_script",
     "embed_gaussians",
-    "film_world",
     "finetune",
     "footprint",
     "inpaint",
@@ -231,6 +232,7 @@ __all__ = [
     "writable_folder",
     "write_ply",
     "write_png",
+    "write_world",
 ]
 
 

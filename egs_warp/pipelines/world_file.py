@@ -59,7 +59,7 @@ def read_world(
     Args:
         path: YAML file; names of captures are relative to its folder.
         device: Warp device; None uses Warp's current device.
-        progress: Called with the name of each body and stage as it starts.
+        progress: Called with the name of each body before it is created.
 
     Raises:
         UserError: The file is invalid, with the line of the mistake, or a body cannot be created or placed.
@@ -84,9 +84,8 @@ def read_world(
             key = repr([entry.get(name) for name in _MAKER_KEYS])
             name = entry.get("name", Path(entry["capture"]).stem)
             if key not in bodies:
-                bodies[key] = _make_body(
-                    path.parent, entry, device, lambda stage, name=name: progress(f"{name}: {stage}")
-                )
+                progress(name)
+                bodies[key] = _make_body(path.parent, entry, device)
                 notes += [f"{name}: {note}" for note in bodies[key].notes]
             name = _unused_name(world, name) if "name" not in entry else name
             placed = world.add(
@@ -171,19 +170,17 @@ def _check_keys(path: Path, entry: Mapping[str, Any], line: int) -> None:
             raise UserError(f"{path}, line {line}: {key} is for {kind}; {advice}")
 
 
-def _make_body(
-    folder: Path, entry: Mapping[str, Any], device: str | None, progress: Callable[[str], object]
-) -> Creature | Prop:
+def _make_body(folder: Path, entry: Mapping[str, Any], device: str | None) -> Creature | Prop:
     """Create the body of an entry; the name of its capture is relative to ``folder``."""
     cloud = read_capture(folder / entry["capture"], device=device).cloud
     plane = Plane.from_coefficients(*entry["plane"]) if "plane" in entry else None
     up, scale = entry.get("up"), {name: entry.get(name) for name in ("metres_per_unit", "height")}
     if entry.get("prop", False):
         density = {"density": entry["density"]} if "density" in entry else {}
-        return make_prop(cloud, up=up, plane=plane, **scale, **density, progress=progress)
+        return make_prop(cloud, up=up, plane=plane, **scale, **density)
     nodes = {"nodes": entry["nodes"]} if "nodes" in entry else {}
     options = CreatureOptions(front=entry.get("front"), **scale, **nodes)
-    return make_creature(cloud, up=up, plane=plane, options=options, progress=progress)
+    return make_creature(cloud, up=up, plane=plane, options=options)
 
 
 def _unused_name(world: World, name: str) -> str:
