@@ -214,5 +214,6 @@ def _heading_of(creature: Creature) -> float:
 
 
 def _where(member: PlacedBody) -> str:
-    x, y, _ = member.body.body.centre_of_mass(member.body.start.positions)
+    # Adding zero turns -0 into 0.
+    x, y, _ = np.round(member.body.body.centre_of_mass(member.body.start.positions), 2) + 0.0
     return f"({x:.2f}, {y:.2f})"
