@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.train_capture import TrainResult, train
     from egs_warp.pipelines.world import PlacedBody, World
     from egs_warp.pipelines.world_file import WorldScript, read_world
-    from egs_warp.pipelines.world_run import PropRun, WorldRun
+    from egs_warp.pipelines.world_run import WorldRun
     from egs_warp.render.autograd import render_torch
     from egs_warp.render.rasteriser import render_gaussians
     from egs_warp.segmentation.clearance import ExtentMeasure, StraddlingOptions, StraddlingPolicy
@@ -119,7 +119,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "pipelines.train_capture": ("TrainResult", "train"),
     "pipelines.world": ("PlacedBody", "World"),
     "pipelines.world_file": ("WorldScript", "read_world"),
-    "pipelines.world_run": ("PropRun", "WorldRun"),
+    "pipelines.world_run": ("WorldRun",),
     "render.autograd": ("render_torch",),
     "render.rasteriser": ("render_gaussians",),
     "segmentation.clearance": ("StraddlingPolicy", "StraddlingOptions", "ExtentMeasure"),
@@ -172,7 +172,6 @@ __all__ = [
     "Plane",
     "PreparedScene",
     "Prop",
-    "PropRun",
     "Push",
     "Quantity",
     "Report",

@@ -18,7 +18,7 @@ UP = np.array([0.0, 0.0, 1.0])
     [
         ("friction: 0.6\n", "line 1: bodies is missing; give a list of bodies"),
         ("bodies:\n- capture: a.ply\n  moton: jump\n", r"line 3: bodies.1.moton: unknown key \(did you mean 'motion'"),
-        ("bodies:\n- capture: a.ply\n\n  at: [0, 1, 2]\n", r"line 4: bodies.1.at: '\[0, 1, 2\]' is not valid; give two"),
+        ("bodies:\n- capture: a.ply\n\n  at: [0, 1, 2]\n", r"line 4: bodies.1.at: '\[0, 1, 2\]' is not valid"),
         ("bodies:\n- capture: a.ply\n- prop: true\n", "line 3: bodies.2: capture is missing; give the name"),
         ("bodies:\n- {capture: a.ply, density: 3}\n", "line 2: density is for a prop; add prop: true"),
         ("bodies:\n- {capture: a.ply, motion: fly}\n", "line 2: .*fly"),
