@@ -1,8 +1,8 @@
 """The contacts of a step, in one world or in many, and the products with their Jacobian W (Eq. 8).
 
 A contact consists of a surface point that moves with the four nodes of its tetrahedron, and a frame of a unit normal
-and two unit tangents. If the point touches another body, a second tetrahedron with negative weights follows, so that the
-contact velocity is relative to that body. W maps nodal velocities to contact velocities in these frames; W^T maps
+and two unit tangents. If the point touches another body, a second tetrahedron with negative weights follows, so that
+the contact velocity is relative to that body. W maps nodal velocities to contact velocities in these frames; W^T maps
 contact forces to nodal forces.
 
 ``ContactSet`` is the record of contacts for one world on the host, one world on a GPU, and many worlds. Its arrays are

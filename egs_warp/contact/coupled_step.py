@@ -101,6 +101,11 @@ class NewtonOptions:
 class CoupledSolver(NewtonOptions):
     """Newton's method on velocities and contact forces of one world."""
 
+    @property
+    def friction(self) -> float:
+        """Coulomb coefficient."""
+        return self.detector.geometry.friction
+
     def solve(
         self,
         response: ContactLinearization,
@@ -183,8 +188,7 @@ class _OneRound:
         """Take a full Newton step and judge its trial. A GPU takes further steps until one needs a decision of the
         host; all but the last are accepted.
         """
-        friction = self._solver.detector.geometry.friction
-        self._steps = self.iterate.newton_steps(self._normal_bias, friction, self.progress)
+        self._steps = self.iterate.newton_steps(self._normal_bias, self._solver.friction, self.progress)
         self._accept(self._steps.trial)
 
     def halve_step(self, worlds: tuple[int, ...]) -> None:

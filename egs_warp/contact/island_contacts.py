@@ -14,16 +14,38 @@ from egs_warp.contact.newton import NewtonIterate
 from egs_warp.contact.pair_contact import PairContactDetector
 from egs_warp.contact.selection import ACTIVATION_DEPTH
 
+_MIN_RATIO = 1e-6
+"""Lower bound of Coulomb coefficients in their ratios, because a tangent of length 0 has no velocity."""
+
 
 @dataclass(frozen=True)
 class IslandContacts:
     """Detection and selection of the contacts of an island. Contacts are identified by the numbers of
-    ``PairContactDetector``; all arrays have the concatenated nodes of the bodies."""
+    ``PairContactDetector``; all arrays have the concatenated nodes of the bodies.
+
+    Coulomb's law of the island has one coefficient, the largest. A contact with another coefficient has shorter
+    tangents: with the ratio s of the coefficients, tangents s t have velocities s u_t and forces f_t / s, so that the
+    cone |f_t / s| <= mu f_n is the cone of the coefficient s mu.
+    """
 
     grounds: tuple[ContactDetector, ...]
     """Contact of each body with the ground."""
     pairs: PairContactDetector
     """Contact between the bodies."""
+    frictions: np.ndarray
+    """(k, k + 1) Coulomb coefficients of the contacts of each body with each other body, and in the last column with
+    the ground."""
+
+    @property
+    def friction(self) -> float:
+        """The largest Coulomb coefficient."""
+        return float(self.frictions.max())
+
+    def tangent_lengths(self, keys: np.ndarray) -> np.ndarray:
+        """Return (n, 3), the lengths of the axes of the contacts with the ``keys`` (n, 3) of ``PairContactDetector``: 1
+        for the normal, and the ratio of the Coulomb coefficients for the tangents."""
+        ratios = np.maximum(self.frictions[keys[:, 0], keys[:, 1]], _MIN_RATIO) / max(self.friction, _MIN_RATIO)
+        return np.column_stack([np.ones(len(keys)), ratios, ratios])
 
     def select(self, previous: np.ndarray, loaded: np.ndarray, end_positions: np.ndarray) -> np.ndarray:
         """Select the contacts of a step.
@@ -57,6 +79,7 @@ class IslandContacts:
             joined = joined.concatenate(other)
         back = np.argsort(np.concatenate(order))
         arrays = {name: values[back] for name, values in joined.batched_fields()}
+        arrays["axes"] = arrays["axes"] * self.tangent_lengths(keys)[:, :, None]
         return replace(joined, **arrays)
 
     def _as_two_sided(self, body: int, contacts: ContactSet) -> ContactSet:
@@ -111,16 +134,19 @@ class IslandContacts:
 @dataclass(frozen=True)
 class IslandSolver(CoupledSolver):
     """Newton's method on velocities and contact forces of an island. ``detector`` and ``points`` are those of its first
-    body; they define the friction coefficient."""
+    body and are not used."""
 
     contacts: IslandContacts = field(kw_only=True)
     """Contacts of the island."""
+
+    @property
+    def friction(self) -> float:
+        """Coulomb coefficient."""
+        return self.contacts.friction
 
     def with_penetrating_points(self, end: NewtonIterate) -> ContactSet | None:
         """Return the contacts of ``end``, extended by the points that are too deep at ``end``; None if no point is."""
         problem, contacts = end.linearization.tangent.problem, end.linearization.contacts
         start, tolerance = problem.state.positions, self.penetration_tolerance
-        added = self.contacts.find_penetrating(
-            contacts.points, start, problem.end_positions(end.velocities), tolerance
-        )
+        added = self.contacts.find_penetrating(contacts.points, start, problem.end_positions(end.velocities), tolerance)
         return None if len(added) == 0 else contacts.concatenate(self.contacts.contact_set(added, start))

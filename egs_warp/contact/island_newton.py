@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -73,15 +73,15 @@ class IslandNewtonIterate(HostNewtonStep):
     def with_new_tangent(self) -> Self:
         """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""
         old = self.linearization.tangent
-        tangent = old.problem.tangent(old.factors, self.velocities, self.tensions)
+        tangent: Any = old.problem.tangent(old.factors, self.velocities, self.tensions)
         return replace(self, linearization=IslandLinearization.of(tangent, self.linearization.contacts))
 
 
 class IslandLinearizer:
     """Builder of the contact linearisations of an island (see ``ContactLinearizer``)."""
 
-    def __call__(self, tangent: IslandTangent, contacts: ContactSet) -> IslandLinearization:
-        """Linearise ``contacts`` with ``tangent``."""
+    def __call__(self, tangent: Any, contacts: ContactSet) -> IslandLinearization:
+        """Linearise ``contacts`` with ``tangent``, an ``IslandTangent``."""
         return IslandLinearization.of(tangent, contacts)
 
     def predict_velocities(

@@ -74,7 +74,6 @@ class PairContactDetector:
         """(nbody + 1,) first node of each body, and the number of all nodes."""
         self.point_starts = np.concatenate([[0], np.cumsum(points)]).astype(int)
         """(nbody + 1,) first contact point of each body, and the number P of all points."""
-        self._margins = [BODY_INFLATION * body.selector.activation_distance + _protrusion(body) for body in bodies]
 
     def numbers(self, body: int | np.ndarray, points: np.ndarray, other: int | np.ndarray) -> np.ndarray:
         """Return the numbers (n,) of the contacts of ``points`` (n,) of ``body`` with the body ``other``, or with the
@@ -92,10 +91,14 @@ class PairContactDetector:
         """Return the ordered pairs (a, b) of bodies whose inflated boxes overlap at ``positions`` (N, 3), both (a, b)
         and (b, a), in ascending order.
         """
-        boxes = [
-            (part.min(axis=0) - margin, part.max(axis=0) + margin)
-            for part, margin in zip(self._split(positions), self._margins, strict=True)
-        ]
+        boxes = []
+        for body, part in zip(self.bodies, self._split(positions), strict=True):
+            # The cage encloses the body, but the tetrahedron of a prop does not.
+            corners = (
+                part if len(body.geometry.mesh.tets) > 1 else body.geometry.weights @ part[body.geometry.mesh.tets[0]]
+            )
+            margin = BODY_INFLATION * body.selector.activation_distance
+            boxes.append((corners.min(axis=0) - margin, corners.max(axis=0) + margin))
         lows, highs = (np.array(each).reshape(-1, 3) for each in zip(*boxes, strict=True))
         overlaps = np.all((lows[:, None] <= highs) & (lows <= highs[:, None]), axis=2)
         np.fill_diagonal(overlaps, False)
@@ -204,7 +207,15 @@ class PairContactDetector:
         launch_cached(
             kernels.pair_record_kernel,
             shape,
-            inputs=[*first.points, *second.shape, chosen, count, first.tets_of(second), first.positions, second.positions],
+            inputs=[
+                *first.points,
+                *second.shape,
+                chosen,
+                count,
+                first.tets_of(second),
+                first.positions,
+                second.positions,
+            ],
             outputs=outputs,
             device=self.device,
         )

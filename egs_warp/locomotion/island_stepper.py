@@ -8,8 +8,9 @@ yield to it as they would in the solve. A creature that is planned later knows t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -22,31 +23,66 @@ from egs_warp.contact.pair_contact import PairContactDetector
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.island_problem import IslandProblem
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.linear_step import PredictedStep, StepInputs
+from egs_warp.locomotion.linear_step import PredictedStep
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import Plan, StageClock
 from egs_warp.locomotion.prediction import predict_end
 from egs_warp.locomotion.step_cost import objectives_value
-from egs_warp.locomotion.stepper import MAX_HALVINGS, REPLAN_FACTOR, REPLAN_MARGIN, LocomotionStepper, StepReport, WarmStart
+from egs_warp.locomotion.stepper import (
+    MAX_HALVINGS,
+    REPLAN_FACTOR,
+    REPLAN_MARGIN,
+    LocomotionStepper,
+    StepReport,
+    WarmStart,
+)
 from egs_warp.muscles.tension import MuscleEnergy
 
-States, Memories, Objectives = Sequence[BodyState], Sequence[WarmStart], Sequence[Sequence[AnyObjective]]
-"""State, warm start and objectives of each body."""
+MAX_PAIR_DEPTH = 0.01
+"""Depth of one body in another, in body heights, beyond which a step that has increased it is repeated as half steps.
+The planes of contact are those at the start of the step, which is inaccurate where a body moves far over an edge.
+"""
+
+States: TypeAlias = Sequence[BodyState]
+Memories: TypeAlias = Sequence[WarmStart]
+Objectives: TypeAlias = Sequence[Sequence[AnyObjective]]
+
+
+@dataclass(frozen=True)
+class IslandInputs:
+    """Inputs of a step of an island that are known before its activations are planned."""
+
+    problem: IslandProblem
+    contacts: ContactSet
+    normal_bias: np.ndarray
+    """(n,) m/s, velocity bias of each contact in the normal direction."""
+    friction: float
+    forces: np.ndarray
+    """(n, 3) N, contact forces of the previous step; zero for contacts that are new in this step."""
 
 
 class IslandStepper:
     """Stepper of the bodies of an island."""
 
-    def __init__(self, members: Sequence[int], steppers: Sequence[LocomotionStepper], pairs: PairContactDetector) -> None:
+    def __init__(
+        self,
+        members: Sequence[int],
+        steppers: Sequence[LocomotionStepper],
+        pairs: PairContactDetector,
+        frictions: np.ndarray,
+    ) -> None:
         """Make the stepper of some bodies of a world.
 
         Args:
             members: indices of the bodies in the world, ascending.
-            steppers: stepper of each of them.
+            steppers: stepper of each of the k bodies.
             pairs: contact between them.
+            frictions: (k, k) Coulomb coefficients between them.
         """
         self.members, self.steppers = tuple(members), tuple(steppers)
-        self.contacts = IslandContacts(tuple(stepper.detector for stepper in steppers), pairs)
+        with_ground = np.array([[stepper.geometry.friction] for stepper in steppers])
+        detectors = tuple(stepper.detector for stepper in steppers)
+        self.contacts = IslandContacts(detectors, pairs, np.hstack([frictions, with_ground]))
         self.solver = IslandSolver(
             steppers[0].detector,
             steppers[0].selector,
@@ -60,14 +96,14 @@ class IslandStepper:
     def _factors(self) -> tuple[object, ...]:
         return tuple(stepper.factors for stepper in self.steppers)
 
-    def advance(
-        self, states: States, memories: Memories, objectives: Objectives, dt: float
-    ) -> list[list[StepReport]]:
-        """Make one step of ``dt`` s; if it does not converge, repeat it as half steps. See ``WorldStepper.advance`` and
-        ``LocomotionStepper.advance``."""
+    def advance(self, states: States, memories: Memories, objectives: Objectives, dt: float) -> list[list[StepReport]]:
+        """Make one step of ``dt`` s; if it does not converge, or if bodies penetrate too far, repeat it as half steps.
+        See ``WorldStepper.advance`` and ``LocomotionStepper.advance``."""
         reports = self._step(states, memories, objectives, None, dt)
         if reports[0].converged:
-            return [[report] for report in reports]
+            if not self._is_too_deep(reports, states):
+                return [[report] for report in reports]
+            return self._half_steps(states, memories, [r.activations for r in reports], dt, MAX_HALVINGS)
         candidates = [
             self._half_steps(states, memories, activations, dt, MAX_HALVINGS)
             for activations in ([r.activations for r in reports], [memory.activations for memory in memories])
@@ -77,12 +113,13 @@ class IslandStepper:
     def _half_steps(
         self, states: States, memories: Memories, activations: Sequence[np.ndarray], dt: float, max_halvings: int
     ) -> list[list[StepReport]]:
-        """Make two steps of ``dt`` / 2 seconds with given activations. A step that does not converge is halved again, up
-        to ``max_halvings`` - 1 times."""
+        """Make two steps of ``dt`` / 2 s with given activations. A step that does not converge, or in which bodies
+        penetrate too far, is halved again, up to ``max_halvings`` - 1 times."""
         done: list[list[StepReport]] = [[] for _ in self.steppers]
         for _ in range(2):
-            reports = [[r] for r in self._step(states, memories, [()] * len(states), activations, 0.5 * dt)]
-            if not reports[0][0].converged and max_halvings > 1:
+            ends = self._step(states, memories, [()] * len(states), activations, 0.5 * dt)
+            reports = [[end] for end in ends]
+            if max_halvings > 1 and (not ends[0].converged or self._is_too_deep(ends, states)):
                 reports = self._half_steps(states, memories, activations, 0.5 * dt, max_halvings - 1)
             for before, after in zip(done, reports, strict=True):
                 before += after
@@ -90,9 +127,16 @@ class IslandStepper:
             memories = [WarmStart.from_report(each[-1]) for each in done]
         return done
 
-    def _rank(
-        self, done: Sequence[Sequence[StepReport]], states: States, objectives: Objectives
-    ) -> tuple[bool, float]:
+    def _is_too_deep(self, ends: Sequence[StepReport], states: States) -> bool:
+        """Return True if a step from ``states`` has pushed a body too deep into another or into the ground."""
+        height = min(stepper.body.height for stepper in self.steppers)
+        end, limit = np.array([report.min_gap for report in ends]), -MAX_PAIR_DEPTH * height
+        if end.min() >= limit:
+            return False
+        start = self.contacts.min_gaps(np.concatenate([state.positions for state in states]))
+        return bool(((end < limit) & (end < start)).any())
+
+    def _rank(self, done: Sequence[Sequence[StepReport]], states: States, objectives: Objectives) -> tuple[bool, float]:
         """Return the sort key of half steps; see ``LocomotionStepper.advance``."""
         value = 0.0
         for stepper, reports, state, targets in zip(self.steppers, done, states, objectives, strict=True):
@@ -112,11 +156,11 @@ class IslandStepper:
         activations: Sequence[np.ndarray] | None,
         dt: float,
     ) -> list[StepReport]:
-        """Make one step of ``dt`` s with given ``activations``, or with planned ones if they are None; return the report
-        of each body."""
+        """Make one step of ``dt`` s with given ``activations``, or with planned ones if they are None. Return the
+        report of each body."""
         clock = StageClock()
         start = self._start(states, memories, dt)
-        problem: IslandProblem = start.problem
+        problem = start.problem
         clock.lap("detect")
         current = [memory.activations for memory in memories] if activations is None else list(activations)
         response, velocities, forces = predict_end(self._linearizer, self._factors, start, self._tensions(current))
@@ -135,7 +179,7 @@ class IslandStepper:
             plans, result = self._replan(problem, plans, expected, result, memories, objectives, clock)
         return self._reports(problem, plans, result, clock)
 
-    def _start(self, states: States, memories: Memories, dt: float) -> StepInputs:
+    def _start(self, states: States, memories: Memories, dt: float) -> IslandInputs:
         """Detect the contacts of a step and collect its inputs."""
         problem = IslandProblem(
             tuple(
@@ -146,9 +190,10 @@ class IslandStepper:
         previous, forces = self._previous_contacts(memories)
         numbers = self.contacts.select(previous, forces[:, 0] > 0.0, problem.ballistic_positions)
         contacts = self.contacts.contact_set(numbers, problem.state.positions)
-        friction = self.steppers[0].geometry.friction
-        bias, forces = self.solver.normal_bias(contacts, dt), contacts.transferred_forces(previous, forces)
-        return StepInputs(problem, contacts, bias, friction, np.zeros(0), forces)
+        forces = contacts.transferred_forces(previous, forces)
+        forces = forces / self.contacts.tangent_lengths(self.contacts.pairs.keys(numbers))
+        bias = self.solver.normal_bias(contacts, dt)
+        return IslandInputs(problem, contacts, bias, self.contacts.friction, forces)
 
     def _previous_contacts(self, memories: Memories) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers (m,) and forces (m, 3) N of the contacts of the previous step."""
@@ -200,14 +245,15 @@ class IslandStepper:
             own = replace(
                 predicted, activations=plans[body].activations, forces=forces, body=body, other_tensions=tensions
             )
-            plans[body] = stepper.planner.plan(own, memories[body].activations, objectives[body], clock)
+            planner = replace(stepper.planner, friction=self.contacts.friction)
+            plans[body] = planner.plan(own, memories[body].activations, objectives[body], clock)
             forces = plans[body].forces
             # The end that the last plan expects is the end that all plans expect together.
             plans = [replace(plan, velocities=plans[body].velocities, forces=forces) for plan in plans]
         return plans
 
     def _solve(self, response: ContactLinearization, plans: Sequence[Plan]) -> CoupledResult:
-        tensions = self._tensions([plan.activations for plan in plans])
+        tensions: Any = self._tensions([plan.activations for plan in plans])
         return self.solver.solve(response, tensions, velocities=plans[0].velocities, forces=plans[0].forces)
 
     def _replan(
@@ -220,8 +266,8 @@ class IslandStepper:
         objectives: Objectives,
         clock: StageClock,
     ) -> tuple[Sequence[Plan], CoupledResult]:
-        """Plan again, about the solved end, the creatures whose objectives cost clearly more than ``expected`` (k,), and
-        solve again; see ``LocomotionStepper.step``. Return the plans and the result with the lower total value."""
+        """Plan again, about the solved end, the creatures whose objectives cost clearly more than ``expected`` (k,).
+        Solve again, and return the plans and the result with the lower total value; see ``LocomotionStepper.step``."""
         reached = self._values(problem, result.contacts, result, objectives)
         worse = np.flatnonzero(reached > REPLAN_FACTOR * expected + REPLAN_MARGIN)
         if len(worse) == 0:
@@ -247,7 +293,9 @@ class IslandStepper:
         parts = zip(problem.problems, problem.split(end.velocities), pushes, objectives, strict=True)
         return np.array(
             [
-                objectives_value(own, contacts.with_nodes_of(problem.nodes_of(body)), targets, ends, push, own.body.speed_unit)
+                objectives_value(
+                    own, contacts.with_nodes_of(problem.nodes_of(body)), targets, ends, push, own.body.speed_unit
+                )
                 for body, (own, ends, push, targets) in enumerate(parts)
             ]
         )
@@ -258,6 +306,9 @@ class IslandStepper:
         """Return the report of each body at the end of a solve."""
         contacts, ends = result.contacts, problem.end_positions(result.velocities)
         keys, end_gaps = self.contacts.pairs.keys(contacts.points), contacts.end_gaps(problem.dt, result.velocities)
+        lengths = self.contacts.tangent_lengths(keys)
+        contacts = replace(contacts, axes=contacts.axes / lengths[:, :, None])
+        forces = result.forces * lengths
         min_gaps, tensions = self.contacts.min_gaps(ends), self._tensions([plan.activations for plan in plans])
         clock.lap("report")
         reports = []
@@ -272,7 +323,7 @@ class IslandStepper:
                     state=BodyState(end, velocities, own.state.time + problem.dt),
                     dt=problem.dt,
                     contacts=own_contacts,
-                    forces=result.forces[chosen],
+                    forces=forces[chosen],
                     end_gaps=end_gaps[chosen],
                     min_gap=float(min_gaps[body]),
                     activations=plan.activations,
@@ -292,8 +343,8 @@ class IslandStepper:
         """Return the indices of the contacts of a body, and these contacts with the nodes of this body alone.
 
         A contact with another body has the face -1 minus its index in the world. Its point is (index + 1) P + p for the
-        own point p of P, or negative for a point of the other body; there the frame is reversed, so that the same forces
-        act on this body.
+        own point p of P. For a point of the other body, it is negative and the frame is reversed, so that the same
+        forces act on this body.
         """
         pairs, start = self.contacts.pairs, int(problem.node_starts[body])
         owned, touched = np.flatnonzero(keys[:, 0] == body), np.flatnonzero(keys[:, 1] == body)

@@ -142,9 +142,7 @@ class StepPlanner:
         )
         previous = self.synergies.mean(last / self.muscles.bounds)
         own = linear.of_coordinates(predicted.coordinates)
-        finish_objectives = objectives_cost(
-            problem, own, contacts.with_nodes_of(predicted.nodes), objectives, speed
-        )
+        finish_objectives = objectives_cost(problem, own, contacts.with_nodes_of(predicted.nodes), objectives, speed)
         activation = self._activation_cost(problem, predicted_velocities, previous, linear.count)
         effort = effort_cost(problem, own, predicted_velocities.ravel(), effort_model)
         cost = finish_objectives() + effort + activation

@@ -226,6 +226,8 @@ class LocomotionStepper:
         Returns:
             State at the end, warm start of the next step, and the report of each step that was made, in order.
         """
+        if self.muscles.segment_count == 0:
+            return self.advance_with_activations(state, memory, memory.activations, dt)
         with one_blas_thread(), self.factors.stream:
             end, after, report = self.step(state, memory, objectives, dt)
             if report.converged:
@@ -333,7 +335,7 @@ class LocomotionStepper:
         ):
             plan, result = self._replan(problem, plan, result, memory, objectives, clock)
         end, after, report = self._finish(problem, plan, result, clock)
-        if self._device_planner is not None and self.muscles.segment_count > 0 and report.converged:
+        if self._device_planner is not None and report.converged:
             # A GPU predicts the next step while the motion computes its objectives.
             start = self._start(end, after, dt)
             self._device_planner.start(start)
@@ -370,17 +372,13 @@ class LocomotionStepper:
         Returns:
             The contact linearisation at the predicted end, and the plan.
         """
-        has_muscles = self.muscles.segment_count > 0
-        if has_muscles and self._device_planner is not None:
+        if self._device_planner is not None:
             planned = self._device_planner.plan(start, objectives)
             clock.lap("plan")
             if planned is not None:
                 return planned
         predicted = self.predict(start)
         clock.lap("predict")
-        if not has_muscles:
-            # A prop has no activations to plan; its expected end is the predicted one.
-            return predicted.linearization, Plan(start.activations, predicted.velocities, predicted.forces)
         return predicted.linearization, self.planner.plan(predicted, start.activations, objectives, clock)
 
     def _replan(

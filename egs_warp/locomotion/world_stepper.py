@@ -40,8 +40,18 @@ class WorldBody:
 class WorldStepper:
     """Stepper of the bodies of one world."""
 
-    def __init__(self, bodies: Sequence[WorldBody]) -> None:
+    def __init__(self, bodies: Sequence[WorldBody], *, frictions: np.ndarray | None = None) -> None:
+        """Make the stepper of k bodies.
+
+        Args:
+            bodies: the bodies; the Coulomb coefficient of each with the ground is that of its contact geometry.
+            frictions: (k, k) Coulomb coefficients between the bodies, symmetric; None takes the geometric mean of their
+                coefficients with the ground.
+        """
         self.bodies = tuple(bodies)
+        with_ground = np.array([body.stepper.geometry.friction for body in bodies])
+        self.frictions = np.sqrt(np.outer(with_ground, with_ground)) if frictions is None else np.asarray(frictions)
+        """(k, k) Coulomb coefficients between the bodies."""
         self.pairs = PairContactDetector(
             [
                 PairBody(body.stepper.geometry, body.stepper.selector, body.level_set, body.rest_positions)
@@ -78,14 +88,15 @@ class WorldStepper:
         """
         done: list[list[StepReport]] = [[] for _ in self.bodies]
         for members in self.islands(states, dt):
-            first = self.bodies[members[0]].stepper
-            parts = [[values[i] for i in members] for values in (states, memories, objectives)]
-            if len(members) > 1:
-                with one_blas_thread(), first.factors.stream:
-                    reports = self._island(members).advance(*parts, dt)
-            else:
-                memory = _with_ground_only(memories[members[0]], self.pairs.point_counts[members[0]])
-                reports = [first.advance(parts[0][0], memory, parts[2][0], dt)[2]]
+            if len(members) == 1:
+                body = members[0]
+                memory = _with_ground_only(memories[body], self.pairs.point_counts[body])
+                _, _, done[body] = self.bodies[body].stepper.advance(states[body], memory, objectives[body], dt)
+                continue
+            with one_blas_thread():
+                reports = self._island(members).advance(
+                    [states[i] for i in members], [memories[i] for i in members], [objectives[i] for i in members], dt
+                )
             for body, each in zip(members, reports, strict=True):
                 done[body] = each
         return done
@@ -104,7 +115,9 @@ class WorldStepper:
     def _island(self, members: tuple[int, ...]) -> IslandStepper:
         if members not in self._islands:
             steppers = [self.bodies[i].stepper for i in members]
-            self._islands[members] = IslandStepper(members, steppers, self.pairs.subset(members))
+            self._islands[members] = IslandStepper(
+                members, steppers, self.pairs.subset(members), self.frictions[np.ix_(members, members)]
+            )
         return self._islands[members]
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.detection import ContactDetector
 from egs_warp.contact.newton import DELASSUS_REGULARIZATION
-from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.pair_contact import PairBody, PairContactDetector
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.linear_solver import LinearSolver
