@@ -8,15 +8,20 @@ this continuation.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import warp as wp
 
-from egs_warp.fem.batched import contiguous, empty_like, launch_on, nonzero
+from egs_warp.fem.batched import ArrayT, contiguous, empty_like, launch_on, nonzero
 from egs_warp.kernels.contact import coulomb as kernels
 from egs_warp.launching import thread_local_cache
 from egs_warp.precision import Vec4, real
+
+if TYPE_CHECKING:
+    import torch
+
+_Residual = TypeVar("_Residual")
 
 TOLERANCE, MAX_ITERATIONS = 1e-12, 16
 """Residual of the projection equations, m/s, at which Newton's method ends, and its maximum number of steps."""
@@ -34,7 +39,9 @@ are more points than the cage can resolve.
 """
 
 
-def regularized(delassus: Any, fraction: float, counts: Any = None, out: Any = None) -> Any:
+def regularized(
+    delassus: ArrayT, fraction: float, counts: torch.Tensor | None = None, out: ArrayT | None = None
+) -> ArrayT:
     """Return the operator with ``fraction`` of its mean diagonal entry added to its diagonal.
 
     Args:
@@ -54,17 +61,19 @@ def regularized(delassus: Any, fraction: float, counts: Any = None, out: Any = N
 
 
 def _continue_from_compliance(
-    solve: Callable[[Any, Any], tuple[Any, Any]], delassus: Any, forces: Any, counts: Any = None
-) -> tuple[Any, Any]:
+    solve: Callable[[ArrayT, ArrayT], tuple[ArrayT, _Residual]],
+    delassus: ArrayT,
+    forces: ArrayT,
+    counts: torch.Tensor | None = None,
+) -> tuple[ArrayT, _Residual]:
     """Solve with less and less compliant contacts, starting from ``forces``.
 
     ``solve`` maps an operator and initial forces to forces and their residual. Return the forces and the residual for
     ``delassus`` itself, without compliance.
     """
-    residual = None
-    for softness in (*REGULARIZATION_STEPS, 0.0):
-        forces, residual = solve(regularized(delassus, softness, counts), forces)
-    return forces, residual
+    for softness in REGULARIZATION_STEPS:
+        forces, _ = solve(regularized(delassus, softness, counts), forces)
+    return solve(delassus, forces)
 
 
 def coulomb_forces(
@@ -144,13 +153,13 @@ _workspace = thread_local_cache(32)(_CoulombWorkspace)
 
 
 def coulomb_forces_of_worlds(
-    counts: Any,
-    delassus: Any,
-    free_velocity: Any,
-    shift: Any,
-    frictions: Any,
-    start: Any,
-) -> tuple[Any, Any]:
+    counts: torch.Tensor,
+    delassus: torch.Tensor,
+    free_velocity: torch.Tensor,
+    shift: torch.Tensor,
+    frictions: torch.Tensor,
+    start: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Compute the Coulomb forces of c worlds on tensors, by the method of ``coulomb_forces``.
 
     Args:
@@ -183,13 +192,13 @@ def coulomb_forces_of_worlds(
 
 
 def _solve_worlds(
-    counts: Any,
-    delassus: Any,
-    free_velocity: Any,
-    shift: Any,
-    frictions: Any,
-    start: Any,
-) -> tuple[Any, Any]:
+    counts: torch.Tensor,
+    delassus: torch.Tensor,
+    free_velocity: torch.Tensor,
+    shift: torch.Tensor,
+    frictions: torch.Tensor,
+    start: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Compute the forces with the kernel alone, without continuation (arguments as in ``coulomb_forces_of_worlds``)."""
     worlds, capacity, _ = start.shape
     forces, residual, size = start.clone(), start.new_zeros(worlds), 3 * capacity
@@ -202,11 +211,11 @@ def _solve_worlds(
 
 
 def enqueue_forces(
-    counts: Any,
-    values: tuple[Any, ...],
-    forces: Any,
-    scratch: tuple[Any, Any, Any],
-    residual: Any,
+    counts: torch.Tensor,
+    values: tuple[torch.Tensor, ...],
+    forces: torch.Tensor,
+    scratch: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    residual: torch.Tensor,
 ) -> None:
     """Queue the kernel for c worlds with contiguous arrays.
 
@@ -221,7 +230,7 @@ def enqueue_forces(
     vectors, indices, matrices = scratch
     lanes = kernels.BLOCK if forces.is_cuda else 1
     launch_on(
-        forces.device,
+        forces,
         kernels.coulomb_kernel,
         (len(forces), lanes),
         inputs=[

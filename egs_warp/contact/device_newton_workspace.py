@@ -140,7 +140,7 @@ class NewtonWorkspace:
         self.started = np.zeros(0)
         """(ROW_SIZE,) row of progress with which the last loop was started."""
 
-    def trial_parts(self) -> Any:
+    def trial_parts(self) -> tuple[torch.Tensor, ...]:
         """Return the last trial, split as in ``parts``."""
         return self.parts(self._trial)
 
@@ -215,10 +215,10 @@ class NewtonWorkspace:
         self.coulomb.enqueue_operator(self.delassus)
         self._host_delassus.copy_(self.delassus.view(-1), non_blocking=True)
 
-    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
+    def _launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self._device)
 
-    def parts(self, state: torch.Tensor) -> Any:
+    def parts(self, state: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Split an iterate into velocities (3N,), velocities after a Newton step without contact forces (3N,),
         residual without contact forces (3N,) and forces (3K,).
         """

@@ -175,7 +175,7 @@ class MultifrontalLdl:
         self._added = np.ascontiguousarray(across), np.ascontiguousarray(through), np.ascontiguousarray(inverse)
         return True
 
-    def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
+    def solve(self, right: np.ndarray, projection: MomentumProjection[np.ndarray] | None = None) -> np.ndarray:
         """Solve for ``right``; see ``LinearSolver.solve``."""
         if self._added is None:
             return self._solve_unprojected(right, projection)
@@ -223,7 +223,9 @@ class MultifrontalLdl:
         )
         return workspace.quadratic[:count, :count].copy(), workspace.linear.ravel()[:count].copy()
 
-    def _solve_unprojected(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
+    def _solve_unprojected(
+        self, right: np.ndarray, projection: MomentumProjection[np.ndarray] | None = None
+    ) -> np.ndarray:
         assert self.status is not FactorStatus.NONE, "call factor() first"
         right = np.asarray(right, dtype=np.float64)
         solution = np.empty(right.shape)
@@ -251,7 +253,7 @@ class MultifrontalLdl:
         else:
             launch()
 
-    def solving_one(self, projection: MomentumProjection) -> tuple[list[Any], list[int], wp.array]:
+    def solving_one(self, projection: MomentumProjection[np.ndarray]) -> tuple[list[Any], list[int], wp.array]:
         """Return the kernel arguments of a solve for one right-hand side (``supernodal.solve_vector_native``).
 
         Args:
@@ -301,9 +303,9 @@ class _ProjectionArrays:
             self._arrays[name], array = _shared_zeros(size)
             setattr(self.struct, name, array)
         self._ratio, self.struct.inertia_ratio = _shared_zeros(1)
-        self._loaded: MomentumProjection | None = None
+        self._loaded: MomentumProjection[np.ndarray] | None = None
 
-    def load(self, projection: MomentumProjection) -> Any:
+    def load(self, projection: MomentumProjection[np.ndarray]) -> Any:
         """Copy ``projection`` to the arrays, unless it was the last one, and return the kernels' struct."""
         if self._loaded is not projection:
             self._loaded, self._ratio[0] = projection, projection.inertia_ratio
