@@ -82,9 +82,6 @@ def coulomb_forces(
     shift: np.ndarray,
     friction: float,
     start: np.ndarray,
-    *,
-    tolerance: float = TOLERANCE,
-    iteration_limit: int = MAX_ITERATIONS,
 ) -> tuple[np.ndarray, float]:
     """Compute contact forces f (n, 3) with exact Coulomb friction and complementary f_n >= 0 and u_n + shift >= 0,
     where u = free_velocity + G f (Eq. 8, 9).
@@ -98,8 +95,6 @@ def coulomb_forces(
         shift: (n,) m/s, bias of the normal velocities.
         friction: Coulomb coefficient mu.
         start: (n, 3) newtons, initial forces.
-        tolerance: residual at which Newton's method ends, m/s.
-        iteration_limit: maximum number of Newton steps of the first attempt.
 
     Returns:
         The forces (n, 3) in newtons and the residual in m/s.
@@ -107,7 +102,7 @@ def coulomb_forces(
     count = len(shift)
     if count == 0:
         return start, 0.0
-    workspace = _workspace(count, tolerance, iteration_limit)
+    workspace = _workspace(count)
     result, residual = workspace.solve(delassus, free_velocity, shift, friction, start)
     if residual <= FAILURE_TOLERANCE:
         return result, residual
@@ -122,7 +117,7 @@ class _CoulombWorkspace:
     as solving for ten contacts.
     """
 
-    def __init__(self, count: int, tolerance: float, iteration_limit: int) -> None:
+    def __init__(self, count: int) -> None:
         size = 3 * count
         self._delassus, self._free, self._shifts = np.zeros((1, size, size)), np.zeros((1, size)), np.zeros((1, count))
         self._friction, self._forces, self._residual = np.zeros(1), np.zeros((1, size)), np.zeros(1)
@@ -133,7 +128,7 @@ class _CoulombWorkspace:
         self._launch: Any = wp.launch(
             kernels.coulomb_kernel,
             dim=(1, 1),
-            inputs=[counts, *values, tolerance, iteration_limit, _shared(self._forces), *scratch],
+            inputs=[counts, *values, TOLERANCE, MAX_ITERATIONS, _shared(self._forces), *scratch],
             outputs=[_shared(self._residual)],
             device="cpu",
             record_cmd=True,
