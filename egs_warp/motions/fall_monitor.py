@@ -96,7 +96,7 @@ class FallMonitor:
             self._lost_time = 0.0
             self._check_recovery(motion, elapsed)
             return
-        is_lost = not tips_body(motion) and self._is_beyond_support(state, report)
+        is_lost = not tips_body(motion) and self._is_outside_support(state, report)
         self._lost_time = self._lost_time + elapsed if is_lost else 0.0
         # Do not reset the lying time in the air, because the body may be bouncing on its side.
         if report.forces[:, 0].sum() <= 0.0:
@@ -126,7 +126,7 @@ class FallMonitor:
             description = before.fall_note if before is not None else None
             self.fallen = description or f"the body has not got up by {self._last_time:.2f} s"
 
-    def _is_beyond_support(self, state: BodyState, report: StepReport) -> bool:
+    def _is_outside_support(self, state: BodyState, report: StepReport) -> bool:
         """Return True if the capture point of a body on the ground is outside the hull of the contacts."""
         contacts, body = report.contacts, self._body
         if contacts.count == 0:
