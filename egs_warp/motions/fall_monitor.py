@@ -129,7 +129,7 @@ class FallMonitor:
     def _is_outside_support(self, state: BodyState, report: StepReport) -> bool:
         """Return True if the capture point of a body on the ground is outside the hull of the contacts."""
         contacts, body = report.contacts, self._body
-        if contacts.count == 0:
+        if contacts.count == 0 or not np.isfinite(state.velocities).all():
             return False
         local = self._ground.local(state.positions)
         com = body.centre_of_mass(local)
