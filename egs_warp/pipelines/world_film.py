@@ -12,10 +12,12 @@ from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.camera import Camera
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.pipelines.captured_body import points_at_rest
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.film import Filmed, encode_film, path_of, rendered_frames, split_deformer
+from egs_warp.pipelines.obstacle_cloud import obstacle_cloud
 from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
-from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW
+from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, BodyResult
 from egs_warp.pipelines.world_run import WorldRun
 
 _ELEVATION = 0.35
@@ -23,33 +25,46 @@ _ELEVATION = 0.35
 the ground between the bodies is visible."""
 _VIEWS = 24
 """Number of directions that are compared."""
+_OBSTACLE_MARGIN = 1.0
+"""Distance from the bodies up to which obstacles are drawn, relative to the extent of the motion."""
 _FACING_WEIGHT = 0.6
 """Weight of the faces relative to the separation of the bodies in the choice of the view."""
 
 
 @dataclass(frozen=True)
 class WorldMotion:
-    """Nodes of all bodies in each frame of a run, for cameras (``FilmedMotion``)."""
+    """Points of all bodies in each frame of a run, for cameras (``FilmedMotion``)."""
 
     time: np.ndarray
     """(n,) s, time of each frame."""
     positions: np.ndarray
-    """(n, N, 3) m, nodes of all bodies, one body after the other."""
+    """(n, N, 3) m, points of all bodies, one body after the other: nodes of a creature, extreme points of a prop."""
     node_mass: np.ndarray
-    """(N,) kg."""
+    """(N,) kg, an equal part of the mass of its body for each point."""
     capture_frame: BodyFrame
     """Frame of the world: cameras from a file are in metres and in the axes of the world."""
 
     @classmethod
     def from_run(cls, run: WorldRun) -> WorldMotion:
         """Return the motion of all bodies of ``run``."""
-        parts = [result.simulation for result in run.results]
+        parts = [_outline(result) for result in run.results]
+        counts = [part.shape[1] for part in parts]
+        masses = [np.full(count, each.body.body.mass / count) for count, each in zip(counts, run.results, strict=True)]
         return cls(
-            run.time,
-            np.concatenate([part.trajectory.positions[part.frames] for part in parts], axis=1),
-            np.concatenate([part.trajectory.node_mass for part in parts]),
-            BodyFrame(np.eye(3), np.zeros(3), 1.0),
+            run.time, np.concatenate(parts, axis=1), np.concatenate(masses), BodyFrame(np.eye(3), np.zeros(3), 1.0)
         )
+
+
+def _outline(result: BodyResult) -> np.ndarray:
+    """Return points (n, N, 3) m of a body in each frame. The nodes of a prop are not near its surface, so extreme
+    points of its surface are returned instead."""
+    body, simulation = result.body, result.simulation
+    positions = simulation.trajectory.positions[simulation.frames]
+    if len(body.mesh.tets) > 1:
+        return positions
+    directions = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    extreme = np.unique(np.argmax(directions @ points_at_rest(body.geometry).T, axis=1))
+    return np.einsum("pw,fwi->fpi", body.geometry.weights[extreme], positions[:, body.mesh.tets[0]])
 
 
 def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | None = None) -> Camera:
@@ -106,7 +121,12 @@ def draw_world_film(
     steps = np.arange(len(motion.time)) if shot.fps == FRAME_RATE else nearest_steps(motion.time, shot.fps)
     camera = resized(world_camera(run, size, view_from), *(shot.size or (size, size)))
     cameras = shot.cameras(camera, motion, steps)
-    deformer = JointDeformer([split_deformer(result) for result in run.results])
+    low, high = motion.positions.min(axis=(0, 1)), motion.positions.max(axis=(0, 1))
+    margin = _OBSTACLE_MARGIN * float((high - low).max())
+    obstacles = obstacle_cloud(
+        run.world.solids, low - margin, high + margin, device=str(run.results[0].body.cloud.device)
+    )
+    deformer = JointDeformer([split_deformer(result) for result in run.results], fixed=obstacles)
     simulations = [result.simulation for result in run.results]
     poses = ([each.trajectory.positions[each.frames[step]] for each in simulations] for step in steps)
     filmed = Filmed(
