@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.joint_deformer import JointDeformer
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.pipelines.captured_body import points_at_rest
@@ -19,12 +21,17 @@ from egs_warp.pipelines.obstacle_cloud import obstacle_cloud
 from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
 from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, BodyResult
 from egs_warp.pipelines.world_run import WorldRun
+from egs_warp.short_repr import short_repr
 
 _ELEVATION = 0.35
 """Ratio of the vertical to the horizontal component of the direction to the camera, higher than for one body so that
 the ground between the bodies is visible."""
 _VIEWS = 24
 """Number of directions that are compared."""
+_LEVEL_WEIGHT = 0.4
+"""Weight of equal distances from the camera; with different distances, bodies of the same size look different."""
+_FRAMED_MARGIN = 0.15
+"""Distance from the bodies up to which obstacles are in the picture, relative to the extent of the motion."""
 _OBSTACLE_MARGIN = 1.0
 """Distance from the bodies up to which obstacles are drawn, relative to the extent of the motion."""
 _FACING_WEIGHT = 0.6
@@ -55,6 +62,20 @@ class WorldMotion:
         )
 
 
+@dataclass(frozen=True)
+class WorldFilm:
+    """File, Gaussians and camera of the film of a world."""
+
+    __repr__ = short_repr
+
+    file: str
+    """Name of the video in the folder of the run."""
+    deformers: Mapping[str, Deformer]
+    """Deformer of the Gaussians of each body after splitting, by the name of the body."""
+    camera: Camera
+    """Fixed camera of the film."""
+
+
 def _outline(result: BodyResult) -> np.ndarray:
     """Return points (n, N, 3) m of a body in each frame. The nodes of a prop are not near its surface, so extreme
     points of its surface are returned instead."""
@@ -68,7 +89,7 @@ def _outline(result: BodyResult) -> np.ndarray:
 
 
 def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | None = None) -> Camera:
-    """Return a fixed camera that shows all bodies during the whole run.
+    """Return a fixed camera that shows all bodies, and obstacles near them, during the whole run.
 
     By default it looks from the direction in which the bodies hide each other least and the creatures face the camera.
 
@@ -78,6 +99,12 @@ def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | None = N
         view_from: (3,) Direction to the camera in the axes of the world.
     """
     points = WorldMotion.from_run(run).positions.reshape(-1, 3)
+    obstacles = _obstacles(run, points)
+    if obstacles is not None:
+        near = obstacles.means.numpy().astype(np.float64)
+        low, high = points.min(axis=0), points.max(axis=0)
+        margin = _FRAMED_MARGIN * float((high - low).max())
+        points = np.concatenate([points, near[((near > low - margin) & (near < high + margin)).all(axis=1)]])
     direction = _clearest_view(run) if view_from is None else np.asarray(view_from, float)
     direction = direction / np.linalg.norm(direction)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -103,8 +130,8 @@ def draw_world_film(
     view_from: Sequence[float] | None = None,
     shadow: bool = True,
     quiet: bool = False,
-) -> str:
-    """Render a simulated world and write its video and ``sheet.png``; return the name of the video.
+) -> WorldFilm:
+    """Render a simulated world and write its video and ``sheet.png``.
 
     Args:
         run: The simulated world.
@@ -121,12 +148,9 @@ def draw_world_film(
     steps = np.arange(len(motion.time)) if shot.fps == FRAME_RATE else nearest_steps(motion.time, shot.fps)
     camera = resized(world_camera(run, size, view_from), *(shot.size or (size, size)))
     cameras = shot.cameras(camera, motion, steps)
-    low, high = motion.positions.min(axis=(0, 1)), motion.positions.max(axis=(0, 1))
-    margin = _OBSTACLE_MARGIN * float((high - low).max())
-    obstacles = obstacle_cloud(
-        run.world.solids, low - margin, high + margin, device=str(run.results[0].body.cloud.device)
-    )
-    deformer = JointDeformer([split_deformer(result) for result in run.results], fixed=obstacles)
+    obstacles = _obstacles(run, motion.positions.reshape(-1, 3))
+    deformers = {name: split_deformer(result) for name, result in run.bodies.items()}
+    deformer = JointDeformer(tuple(deformers.values()), fixed=obstacles)
     simulations = [result.simulation for result in run.results]
     poses = ([each.trajectory.positions[each.frames[step]] for each in simulations] for step in steps)
     filmed = Filmed(
@@ -135,7 +159,15 @@ def draw_world_film(
     )
     frames = rendered_frames(deformer.deform, deformer.rest, poses, filmed, cameras, shot, shadow=shadow)
     path, _ = encode_film(frames, folder, name, cameras[0], shot, motion.time[steps], quiet=quiet)
-    return path.name
+    return WorldFilm(path.name, deformers, camera)
+
+
+def _obstacles(run: WorldRun, points: np.ndarray) -> GaussianCloud | None:
+    """Return Gaussians of the obstacles around ``points`` (n, 3) of the bodies; None if there are no obstacles."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = _OBSTACLE_MARGIN * float((high - low).max())
+    device = str(run.results[0].body.cloud.device)
+    return obstacle_cloud(run.world.solids, low - margin, high + margin, device=device)
 
 
 def _clearest_view(run: WorldRun) -> np.ndarray:
@@ -145,15 +177,17 @@ def _clearest_view(run: WorldRun) -> np.ndarray:
     radii = [0.5 * float(np.ptp(each.trajectory.positions[0][:, :2], axis=0).max()) for each in simulations]
     faces = [result.body.front.direction[:2] for result in run.results if isinstance(result.body, Creature)]
     first, second = np.triu_indices(len(simulations), 1)
-    reach = np.array(radii)[first] + np.array(radii)[second]
+    between, reach = paths[first] - paths[second], np.array(radii)[first] + np.array(radii)[second]
     angles = 2.0 * np.pi * (np.arange(_VIEWS) + 0.5) / _VIEWS
     best, best_score = angles[0], -np.inf
     for angle in angles:
         towards, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
-        apart = np.abs((paths[first] - paths[second]) @ across)
+        apart = np.abs(between @ across)
         separation = float(np.minimum(apart / reach[:, None], 1.0).mean()) if len(first) else 1.0
+        level = float((apart / np.maximum(np.linalg.norm(between, axis=2), 1e-9)).mean()) if len(first) else 1.0
         # A three-quarter view shows a face best.
         facing = float(np.mean([min(face @ towards, 0.8) for face in faces])) if faces else 0.0
-        if separation + _FACING_WEIGHT * facing > best_score:
-            best, best_score = angle, separation + _FACING_WEIGHT * facing
+        score = separation + _LEVEL_WEIGHT * level + _FACING_WEIGHT * facing
+        if score > best_score:
+            best, best_score = angle, score
     return np.array([np.cos(best), np.sin(best), _ELEVATION])

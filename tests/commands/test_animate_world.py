@@ -13,6 +13,7 @@ from egs_warp import cli
 from egs_warp.assets import pawn
 from egs_warp.io import write_ply
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.pipelines.finished_run import FinishedRun
 
 WORLD = """
 friction: 0.5
@@ -43,6 +44,7 @@ def test_a_world_file_gives_one_film_and_the_files_of_each_body(
         t = Trajectory.load(out / name / "trajectory.npz")
         assert t.time[-1] == pytest.approx(4 / 60) and np.isfinite(t.positions).all()
         assert json.loads((out / name / "report.json").read_text())["state"] in ("done", "cut off")
+        assert FinishedRun.read(out / name).mesh.nodes.shape == t.rest_positions.shape
     files = json.loads((out / "manifest.json").read_text())["files"]
     assert {"world.mp4", "sheet.png", "report.json", "jumper/trajectory.npz", "target/report.json"} <= files.keys()
 
