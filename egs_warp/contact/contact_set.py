@@ -84,6 +84,11 @@ class ContactSet(BatchedRecord):
         indices = np.broadcast_to(columns, entries.shape).reshape(-1)
         return sparse.csr_matrix((entries.reshape(-1), indices, offsets), (3 * self.count, 3 * self.node_count))
 
+    @cached_property
+    def jacobian_columns(self) -> sparse.csr_matrix:
+        """Sparse (3N, 3n) transposed contact Jacobian W^T of one world."""
+        return self.jacobian.T.tocsr()
+
     def jacobian_transposed(self, out: Any = None) -> Any:
         """Return the transposed contact Jacobian W^T, (3N, 3n) or (B, 3N, 3K); ``out`` is zeroed memory for it."""
         if out is None:
