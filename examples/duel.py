@@ -1,4 +1,4 @@
-"""Two figurines duel: the first turns to the second in the air and hops against it.
+"""Two figurines duel: the first turns to the second in the air and jumps against it.
 
 Writes the film, the contact sheet, the report, and a trajectory and a report for each body.
 """
@@ -28,7 +28,7 @@ def main(arguments: list[str] | None = None) -> egs.WorldReport:
     world = egs.World(friction=0.8)
     attacker = world.add(figurine, heading=180.0, name="attacker")
     defender = world.add(figurine, at=(chosen.distance, 0.0), heading=180.0, name="defender")
-    motions = {attacker: "twist 180, jump to defender height=0.2", defender: "stand 2"}
+    motions = {attacker: "twist 180, jump 0.5", defender: "stand"}
     run = egs.simulate(world, motions, frames=chosen.frames, get_up=False)
     report = egs.write_world(run, chosen.out, size=chosen.size, overwrite=True)
     print(report.summary())
