@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from egs_warp.deformation.deformer import Deformer
+from egs_warp.deformation.deformer import DeformedGaussians, Deformer
 from egs_warp.deformation.joint_deformer import JointDeformer
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.pipelines.captured_body import points_at_rest
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.film import Filmed, encode_film, path_of, rendered_frames, split_deformer
-from egs_warp.pipelines.obstacle_cloud import obstacle_cloud
+from egs_warp.pipelines.obstacle_cloud import Obstacles, ObstacleShadows, make_obstacles
 from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
 from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, BodyResult
 from egs_warp.pipelines.world_run import WorldRun
+from egs_warp.render.shadow import shadow_blur_radius
 from egs_warp.short_repr import short_repr
 
 _ELEVATION = 0.35
@@ -101,7 +102,7 @@ def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | None = N
     points = WorldMotion.from_run(run).positions.reshape(-1, 3)
     obstacles = _obstacles(run, points)
     if obstacles is not None:
-        near = obstacles.means.numpy().astype(np.float64)
+        near = obstacles.cloud.means.numpy().astype(np.float64)
         low, high = points.min(axis=0), points.max(axis=0)
         margin = _FRAMED_MARGIN * float((high - low).max())
         points = np.concatenate([points, near[((near > low - margin) & (near < high + margin)).all(axis=1)]])
@@ -150,24 +151,38 @@ def draw_world_film(
     cameras = shot.cameras(camera, motion, steps)
     obstacles = _obstacles(run, motion.positions.reshape(-1, 3))
     deformers = {name: split_deformer(result) for name, result in run.bodies.items()}
-    deformer = JointDeformer(tuple(deformers.values()), fixed=obstacles)
+    deformer = JointDeformer(tuple(deformers.values()), fixed=None if obstacles is None else obstacles.cloud)
     simulations = [result.simulation for result in run.results]
     poses = ([each.trajectory.positions[each.frames[step]] for each in simulations] for step in steps)
     filmed = Filmed(
         np.concatenate([path_of(each.trajectory) for each in simulations]),
         max(each.trajectory.height for each in simulations),
     )
-    frames = rendered_frames(deformer.deform, deformer.rest, poses, filmed, cameras, shot, shadow=shadow)
+    deform = deformer.deform
+    if obstacles is not None and shadow:
+        count = deformer.rest.count - obstacles.cloud.count
+        shadows = ObstacleShadows(obstacles, count, blur_radius=shadow_blur_radius(deformer.rest), height=filmed.height)
+        deform = partial(_deform_with_shadows, deformer, shadows)
+    frames = rendered_frames(deform, deformer.rest, poses, filmed, cameras, shot, shadow=shadow)
     path, _ = encode_film(frames, folder, name, cameras[0], shot, motion.time[steps], quiet=quiet)
     return WorldFilm(path.name, deformers, camera)
 
 
-def _obstacles(run: WorldRun, points: np.ndarray) -> GaussianCloud | None:
-    """Return Gaussians of the obstacles around ``points`` (n, 3) of the bodies; None if there are no obstacles."""
+def _deform_with_shadows(
+    deformer: JointDeformer, shadows: ObstacleShadows, poses: Sequence[np.ndarray]
+) -> DeformedGaussians:
+    """Deform all bodies and draw their shadows on the obstacles."""
+    deformed = deformer.deform(poses)
+    shadows.draw(deformed.cloud)
+    return deformed
+
+
+def _obstacles(run: WorldRun, points: np.ndarray) -> Obstacles | None:
+    """Return the obstacles around ``points`` (n, 3) of the bodies; None if there are no obstacles."""
     low, high = points.min(axis=0), points.max(axis=0)
     margin = _OBSTACLE_MARGIN * float((high - low).max())
     device = str(run.results[0].body.cloud.device)
-    return obstacle_cloud(run.world.solids, low - margin, high + margin, device=device)
+    return make_obstacles(run.world.solids, low - margin, high + margin, device=device)
 
 
 def _clearest_view(run: WorldRun) -> np.ndarray:
