@@ -15,7 +15,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.render.shadow import ShadowMap
 from egs_warp.short_repr import short_repr
 
-_SAMPLES = 90
+_SAMPLES = 120
 """Number of Gaussians along the longest side of an obstacle."""
 _WIDTH, _THICKNESS, _LOGIT = 0.62, 0.1, 3.0
 """Standard deviations of a Gaussian along and across its face, in sample spacings, and the logit of its opacity."""
@@ -134,11 +134,24 @@ def _faces(solid: Solid, low: np.ndarray, high: np.ndarray) -> list[tuple[Plane,
         first, second = face.tangents()
         centre = middle - float(face.heights(middle)) * face.normal
         grid = centre + (steps[:, None, None] * first + steps[None, :, None] * second).reshape(-1, 3)
+        grid = np.concatenate([grid, *(_on_edge(grid, face, other, spacing) for other in solid.faces)])
         inside = np.all([other.heights(grid) <= 1e-9 for other in solid.faces if other is not face], axis=0)
         inside &= (grid[:, 2] >= 0.0) & np.all((grid >= low - 1e-9) & (grid <= high + 1e-9), axis=1)
         if inside.any():
             parts.append((face, grid[inside], spacing))
     return parts
+
+
+def _on_edge(points: np.ndarray, face: Plane, other: Plane, spacing: float) -> np.ndarray:
+    """Return the ``points`` (n, 3) of a ``face`` that are at most ``spacing`` beyond its edge with the face ``other``,
+    moved onto the edge, so that slanted edges are straight."""
+    along = other.normal - (other.normal @ face.normal) * face.normal
+    slope = float(np.linalg.norm(along))
+    if other is face or slope < 1e-6:
+        return np.zeros((0, 3))
+    beyond = other.heights(points) / slope
+    near = (beyond > 0.0) & (beyond < spacing)
+    return points[near] - beyond[near, None] * along / slope
 
 
 def _extent(solid: Solid, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
