@@ -16,7 +16,7 @@ def main(arguments: list[str] | None = None) -> egs.WorldReport:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/duel"))
     parser.add_argument("--distance", type=float, default=0.9, help="distance between the figurines, m")
-    parser.add_argument("--nodes", type=int, default=250, help="approximate number of cage nodes of each figurine")
+    parser.add_argument("--nodes", type=int, default=100, help="approximate number of cage nodes of each figurine")
     parser.add_argument("--frames", type=int, help="number of frames (default: until all bodies are at rest)")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
