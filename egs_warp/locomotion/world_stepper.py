@@ -1,15 +1,31 @@
-"""The stepper of a world of several bodies on a common ground (docs/concepts/bodies.md)."""
+"""The stepper of a world of several bodies on a common ground (docs/concepts/bodies.md).
+
+Bodies that may touch each other in a step form an island. An island of one body is stepped by its own
+``LocomotionStepper``, a larger one by an ``IslandStepper``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
+
+from egs_warp.contact.islands import find_islands
+from egs_warp.contact.pair_contact import PairBody, PairContactDetector
 from egs_warp.fem.body import BodyState
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.locomotion.island_stepper import IslandStepper
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
+from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.meshing.level_set import LevelSet
 from egs_warp.short_repr import short_repr
+
+_SLEEP_SPEED = 1e-6
+"""Maximum speed of the nodes of a prop that falls asleep, in sqrt(g H)."""
+_SLEEP_STEPS = 20
+"""Number of successive steps below ``_SLEEP_SPEED`` after which a prop falls asleep."""
 
 
 @dataclass(frozen=True)
@@ -21,14 +37,37 @@ class WorldBody:
     stepper: LocomotionStepper
     """Body, muscles and contact with the ground; a prop has no muscles."""
     level_set: LevelSet
-    """Level set of the captured shape, in the frame of the cage."""
+    """Level set of the captured shape."""
+    rest_positions: np.ndarray
+    """(N, 3) m, nodes of the cage at rest in the frame of the level set."""
 
 
 class WorldStepper:
     """Stepper of the bodies of one world."""
 
-    def __init__(self, bodies: Sequence[WorldBody]) -> None:
+    def __init__(self, bodies: Sequence[WorldBody], *, frictions: np.ndarray | None = None) -> None:
+        """Make the stepper of k bodies.
+
+        Args:
+            bodies: the bodies; the Coulomb coefficient of each with the ground is that of its contact geometry.
+            frictions: (k, k) Coulomb coefficients between the bodies, symmetric; None takes the geometric mean of their
+                coefficients with the ground.
+        """
         self.bodies = tuple(bodies)
+        with_ground = np.array([body.stepper.geometry.friction for body in bodies])
+        self.frictions = np.sqrt(np.outer(with_ground, with_ground)) if frictions is None else np.asarray(frictions)
+        """(k, k) Coulomb coefficients between the bodies."""
+        self.pairs = PairContactDetector(
+            [
+                PairBody(body.stepper.geometry, body.stepper.selector, body.level_set, body.rest_positions)
+                for body in bodies
+            ],
+            device="cpu",
+        )
+        """Contact between the bodies."""
+        self._islands: dict[tuple[int, ...], IslandStepper] = {}
+        self._quiet_steps = np.zeros(len(bodies), int)
+        self._last_reports: list[StepReport | None] = [None] * len(bodies)
 
     def initial_memories(self) -> list[WarmStart]:
         """Return the warm start of a first step of each body."""
@@ -51,9 +90,84 @@ class WorldStepper:
 
         Returns:
             For each body, the report of each step into which its step was divided, in order. The last report contains
-            the state at the end and the warm start of the next step (``WarmStart.from_report``).
+            the state at the end and the warm start of the next step (``WarmStart.from_report``). The contacts of a
+            report include those with other bodies (``IslandStepper``); their faces are negative.
+
+        Props that have been at rest for some steps sleep until a body that is awake comes close: they are not moved,
+        and their contact forces stay.
         """
-        return [
-            body.stepper.advance(state, memory, targets, dt)[2]
-            for body, state, memory, targets in zip(self.bodies, states, memories, objectives, strict=True)
+        done: list[list[StepReport]] = [[] for _ in self.bodies]
+        for members in self.islands(states, dt):
+            asleep = self._asleep(members, states, memories, dt)
+            if asleep is not None:
+                for body, report in zip(members, asleep, strict=True):
+                    done[body] = [report]
+            elif len(members) == 1:
+                body = members[0]
+                memory = _with_ground_only(memories[body], self.pairs.point_counts[body])
+                _, _, done[body] = self.bodies[body].stepper.advance(states[body], memory, objectives[body], dt)
+            else:
+                parts = [states[i] for i in members], [memories[i] for i in members], [objectives[i] for i in members]
+                with one_blas_thread():
+                    reports = self._island(members).advance(*parts, dt)
+                for body, each in zip(members, reports, strict=True):
+                    done[body] = each
+        self._count_quiet_steps(done)
+        return done
+
+    def _asleep(
+        self, members: Sequence[int], states: Sequence[BodyState], memories: Sequence[WarmStart], dt: float
+    ) -> list[StepReport] | None:
+        """Return the reports of an island whose bodies all sleep, with the last contact forces; None if one is awake or
+        its state is not the one in which it fell asleep."""
+        reports = []
+        for body in members:
+            last, state = self._last_reports[body], states[body]
+            if (
+                last is None
+                or self._quiet_steps[body] < _SLEEP_STEPS
+                or last.dt != dt
+                or not np.array_equal(last.contacts.points, memories[body].points)
+                or not np.array_equal(last.forces, memories[body].forces)
+                or not np.array_equal(last.state.positions, state.positions)
+                or not np.array_equal(last.state.velocities, state.velocities)
+            ):
+                return None
+            reports.append(replace(last, state=replace(state, time=state.time + dt), newton_iterations=0))
+        return reports
+
+    def _count_quiet_steps(self, done: Sequence[Sequence[StepReport]]) -> None:
+        for body, reports in enumerate(done):
+            last, soft_body = reports[-1], self.bodies[body].stepper.body
+            is_prop = self.bodies[body].stepper.muscles.segment_count == 0
+            speed = np.abs(last.state.velocities).max()
+            is_quiet = is_prop and last.converged and len(reports) == 1 and speed < _SLEEP_SPEED * soft_body.speed_unit
+            self._quiet_steps[body] = self._quiet_steps[body] + 1 if is_quiet else 0
+            self._last_reports[body] = last
+
+    def islands(self, states: Sequence[BodyState], dt: float) -> list[tuple[int, ...]]:
+        """Return the islands of a step of ``dt`` s: bodies whose inflated boxes overlap at the end of a ballistic
+        motion, or are connected by such overlaps; in the order of their first bodies."""
+        ends = [
+            StepProblem(body.stepper.body, state, dt).ballistic_positions
+            for body, state in zip(self.bodies, states, strict=True)
         ]
+        overlaps = self.pairs.body_pairs(np.concatenate(ends))
+        roots = find_islands(len(self.bodies), np.array(overlaps, int).reshape(-1, 2))
+        return [tuple(np.flatnonzero(roots == root).tolist()) for root in np.unique(roots)]
+
+    def _island(self, members: tuple[int, ...]) -> IslandStepper:
+        if members not in self._islands:
+            steppers = [self.bodies[i].stepper for i in members]
+            self._islands[members] = IslandStepper(
+                members, steppers, self.pairs.subset(members), self.frictions[np.ix_(members, members)]
+            )
+        return self._islands[members]
+
+
+def _with_ground_only(memory: WarmStart, point_count: int) -> WarmStart:
+    """Return the warm start without contacts with other bodies, for a body with ``point_count`` contact points."""
+    on_ground = (memory.points >= 0) & (memory.points < point_count)
+    if on_ground.all():
+        return memory
+    return replace(memory, points=memory.points[on_ground], forces=memory.forces[on_ground])
