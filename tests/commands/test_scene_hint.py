@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from egs_warp.assets import pawn, scene, stool
+from egs_warp.assets import BuiltInObject, pawn, scene, stool
 from egs_warp.commands.scene_hint import scene_notes
 from egs_warp.io import read_capture
 
@@ -15,7 +16,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 @pytest.mark.parametrize("made", [pawn, stool])
-def test_an_object_alone_gets_no_note(made):
+def test_an_object_alone_gets_no_note(made: Callable[..., BuiltInObject]):
     assert scene_notes(made(gaussian_count=3000).cloud, _UP) == []
 
 
