@@ -141,9 +141,9 @@ class PairContactDetector:
         """
         keys, found = self.keys(contacts), [np.zeros(0, int)]
         for a, b in self.body_pairs(end):
-            # The gaps at the end come last, because the record extrapolates in the tetrahedra that they find.
-            start_gaps, end_gaps = self.gaps(a, b, start), self.gaps(a, b, end)
-            if end_gaps.min() < -ACTIVATION_DEPTH * tolerance:
+            if self.gaps(a, b, end).min() < -ACTIVATION_DEPTH * tolerance:
+                # The gaps at the end come last, because the record extrapolates in the tetrahedra that they find.
+                start_gaps, end_gaps = self.gaps(a, b, start), self.gaps(a, b, end)
                 own = keys[(keys[:, 0] == a) & (keys[:, 1] == b), 2]
                 points = self.bodies[a].selector.find_penetrating(own, end_gaps, start_gaps, tolerance)
                 found.append(self.numbers(a, points, b))
