@@ -368,7 +368,7 @@ OTHER_FORMULAS: list[Mutation] = [
         ),
         (
             *("audit: the torque of contact", "locomotion/audit.py"),
-            *("np.cross(_start_points(t) - com[t.contact_step]", "np.cross(_start_points(t)"),
+            *("np.cross(start_points(t) - com[t.contact_step]", "np.cross(start_points(t)"),
             "locomotion/test_audit.py::test_a_run_that_slides_passes",
         ),
         (
