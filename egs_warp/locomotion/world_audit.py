@@ -22,8 +22,8 @@ from egs_warp.meshing.level_set import LevelSet
 from egs_warp.short_repr import short_repr
 
 _SAME_TIME = 1e-6
-"""Maximum difference of two equal times, in the smallest step. Bodies that are apart may be halved differently, so their
-times differ by rounding."""
+"""Maximum difference of two equal times, divided by the smallest step. Bodies that are apart may be halved differently,
+so their times differ by rounding."""
 _MIN_SLOPE = 0.5
 """Lower bound of the slope of a level set in gaps (docs/concepts/bodies.md)."""
 _POINTS_AT_A_TIME = 256
