@@ -1,8 +1,8 @@
 """The contacts of a step, in one world or in many, and the products with their Jacobian W (Eq. 8).
 
 A contact consists of a surface point that moves with the four nodes of its tetrahedron, and a frame of a unit normal
-and two unit tangents. If the point touches another body, a second tetrahedron with negative weights follows, so that the
-contact velocity is relative to that body. W maps nodal velocities to contact velocities in these frames; W^T maps
+and two unit tangents. If the point touches another body, a second tetrahedron with negative weights follows, so that
+the contact velocity is relative to that body. W maps nodal velocities to contact velocities in these frames; W^T maps
 contact forces to nodal forces.
 
 ``ContactSet`` is the record of contacts for one world on the host, one world on a GPU, and many worlds. Its arrays are
@@ -83,6 +83,11 @@ class ContactSet(BatchedRecord):
         offsets = np.arange(0, entries.size + 1, 3 * self.nodes.shape[1], dtype=np.int32)
         indices = np.broadcast_to(columns, entries.shape).reshape(-1)
         return sparse.csr_matrix((entries.reshape(-1), indices, offsets), (3 * self.count, 3 * self.node_count))
+
+    @cached_property
+    def jacobian_columns(self) -> sparse.csr_matrix:
+        """Sparse (3N, 3n) transposed contact Jacobian W^T of one world."""
+        return self.jacobian.T.tocsr()
 
     def jacobian_transposed(self, out: Any = None) -> Any:
         """Return the transposed contact Jacobian W^T, (3N, 3n) or (B, 3N, 3K); ``out`` is zeroed memory for it."""

@@ -117,8 +117,8 @@ class IslandTangent:
         return tuple(block.factors for block in self.blocks)
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
-        """Return J^-1 ``impulses``, m/s, for impulses (3N,) or (3N, m), N s. Columns that are zero in the rows of a body
-        are not solved there."""
+        """Return J^-1 ``impulses``, m/s, for impulses (3N,) or (3N, m), N s. Columns that are zero in the rows of a
+        body are not solved there."""
         solved = np.zeros(impulses.shape)
         for block, right, out in zip(
             self.blocks, self.problem.split(impulses), self.problem.split(solved), strict=True

@@ -8,8 +8,9 @@ yield to it as they would in the solve. A creature that is planned later knows t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from egs_warp.contact.pair_contact import PairContactDetector
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.island_problem import IslandProblem
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.linear_step import PredictedStep, StepInputs
+from egs_warp.locomotion.linear_step import PredictedStep
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import Plan, StageClock
 from egs_warp.locomotion.prediction import predict_end
@@ -38,12 +39,26 @@ from egs_warp.locomotion.stepper import (
 from egs_warp.muscles.tension import MuscleEnergy
 
 MAX_PAIR_DEPTH = 0.01
-"""Depth of one body in another, in body heights, beyond which a step that has increased it is repeated as half steps. The
-planes of contact are those at the start of the step, which is inaccurate where a body moves far over an edge.
+"""Depth of one body in another, in body heights, beyond which a step that has increased it is repeated as half steps.
+The planes of contact are those at the start of the step, which is inaccurate where a body moves far over an edge.
 """
 
-States, Memories, Objectives = Sequence[BodyState], Sequence[WarmStart], Sequence[Sequence[AnyObjective]]
-"""State, warm start and objectives of each body."""
+States: TypeAlias = Sequence[BodyState]
+Memories: TypeAlias = Sequence[WarmStart]
+Objectives: TypeAlias = Sequence[Sequence[AnyObjective]]
+
+
+@dataclass(frozen=True)
+class IslandInputs:
+    """Inputs of a step of an island that are known before its activations are planned."""
+
+    problem: IslandProblem
+    contacts: ContactSet
+    normal_bias: np.ndarray
+    """(n,) m/s, velocity bias of each contact in the normal direction."""
+    friction: float
+    forces: np.ndarray
+    """(n, 3) N, contact forces of the previous step; zero for contacts that are new in this step."""
 
 
 class IslandStepper:
@@ -98,8 +113,8 @@ class IslandStepper:
     def _half_steps(
         self, states: States, memories: Memories, activations: Sequence[np.ndarray], dt: float, max_halvings: int
     ) -> list[list[StepReport]]:
-        """Make two steps of ``dt`` / 2 seconds with given activations. A step that does not converge is halved again, up
-        to ``max_halvings`` - 1 times."""
+        """Make two steps of ``dt`` / 2 s with given activations. A step that does not converge, or in which bodies
+        penetrate too far, is halved again, up to ``max_halvings`` - 1 times."""
         done: list[list[StepReport]] = [[] for _ in self.steppers]
         for _ in range(2):
             ends = self._step(states, memories, [()] * len(states), activations, 0.5 * dt)
@@ -141,11 +156,11 @@ class IslandStepper:
         activations: Sequence[np.ndarray] | None,
         dt: float,
     ) -> list[StepReport]:
-        """Make one step of ``dt`` s with given ``activations``, or with planned ones if they are None; return the report
-        of each body."""
+        """Make one step of ``dt`` s with given ``activations``, or with planned ones if they are None. Return the
+        report of each body."""
         clock = StageClock()
         start = self._start(states, memories, dt)
-        problem: IslandProblem = start.problem
+        problem = start.problem
         clock.lap("detect")
         current = [memory.activations for memory in memories] if activations is None else list(activations)
         response, velocities, forces = predict_end(self._linearizer, self._factors, start, self._tensions(current))
@@ -164,7 +179,7 @@ class IslandStepper:
             plans, result = self._replan(problem, plans, expected, result, memories, objectives, clock)
         return self._reports(problem, plans, result, clock)
 
-    def _start(self, states: States, memories: Memories, dt: float) -> StepInputs:
+    def _start(self, states: States, memories: Memories, dt: float) -> IslandInputs:
         """Detect the contacts of a step and collect its inputs."""
         problem = IslandProblem(
             tuple(
@@ -178,7 +193,7 @@ class IslandStepper:
         forces = contacts.transferred_forces(previous, forces)
         forces = forces / self.contacts.tangent_lengths(self.contacts.pairs.keys(numbers))
         bias = self.solver.normal_bias(contacts, dt)
-        return StepInputs(problem, contacts, bias, self.contacts.friction, np.zeros(0), forces)
+        return IslandInputs(problem, contacts, bias, self.contacts.friction, forces)
 
     def _previous_contacts(self, memories: Memories) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers (m,) and forces (m, 3) N of the contacts of the previous step."""
@@ -238,7 +253,7 @@ class IslandStepper:
         return plans
 
     def _solve(self, response: ContactLinearization, plans: Sequence[Plan]) -> CoupledResult:
-        tensions = self._tensions([plan.activations for plan in plans])
+        tensions: Any = self._tensions([plan.activations for plan in plans])
         return self.solver.solve(response, tensions, velocities=plans[0].velocities, forces=plans[0].forces)
 
     def _replan(
@@ -251,8 +266,8 @@ class IslandStepper:
         objectives: Objectives,
         clock: StageClock,
     ) -> tuple[Sequence[Plan], CoupledResult]:
-        """Plan again, about the solved end, the creatures whose objectives cost clearly more than ``expected`` (k,), and
-        solve again; see ``LocomotionStepper.step``. Return the plans and the result with the lower total value."""
+        """Plan again, about the solved end, the creatures whose objectives cost clearly more than ``expected`` (k,).
+        Solve again, and return the plans and the result with the lower total value; see ``LocomotionStepper.step``."""
         reached = self._values(problem, result.contacts, result, objectives)
         worse = np.flatnonzero(reached > REPLAN_FACTOR * expected + REPLAN_MARGIN)
         if len(worse) == 0:
@@ -328,8 +343,8 @@ class IslandStepper:
         """Return the indices of the contacts of a body, and these contacts with the nodes of this body alone.
 
         A contact with another body has the face -1 minus its index in the world. Its point is (index + 1) P + p for the
-        own point p of P, or negative for a point of the other body; there the frame is reversed, so that the same forces
-        act on this body.
+        own point p of P. For a point of the other body, it is negative and the frame is reversed, so that the same
+        forces act on this body.
         """
         pairs, start = self.contacts.pairs, int(problem.node_starts[body])
         owned, touched = np.flatnonzero(keys[:, 0] == body), np.flatnonzero(keys[:, 1] == body)

@@ -42,13 +42,14 @@ class PredictedStep:
     @property
     def problem(self) -> StepProblem:
         """Step of the planned body."""
-        problem = self.linearization.tangent.problem
-        return problem if self.body is None else problem.problems[self.body]
+        joint: Any = self.linearization.tangent.problem
+        return joint if self.body is None else joint.problems[self.body]
 
     @property
     def nodes(self) -> slice:
         """Nodes of the planned body."""
-        return slice(None) if self.body is None else self.linearization.tangent.problem.nodes_of(self.body)
+        joint: Any = self.linearization.tangent.problem
+        return slice(None) if self.body is None else joint.nodes_of(self.body)
 
     @property
     def coordinates(self) -> slice:

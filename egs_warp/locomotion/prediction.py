@@ -2,16 +2,46 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.newton import ContactLinearization
-from egs_warp.locomotion.linear_step import PREDICTION_ITERATIONS, StepInputs
+from egs_warp.locomotion.linear_step import PREDICTION_ITERATIONS
+
+
+class PredictionInputs(Protocol):
+    """Inputs of the prediction: ``StepInputs`` of one body, or ``IslandInputs``."""
+
+    @property
+    def problem(self) -> Any:
+        """``StepProblem`` or ``IslandProblem``."""
+        ...
+
+    @property
+    def contacts(self) -> ContactSet:
+        """Contacts of the step."""
+        ...
+
+    @property
+    def normal_bias(self) -> np.ndarray:
+        """(n,) m/s, velocity bias of each contact in the normal direction."""
+        ...
+
+    @property
+    def friction(self) -> float:
+        """Coulomb coefficient."""
+        ...
+
+    @property
+    def forces(self) -> np.ndarray:
+        """(n, 3) N, contact forces of the previous step."""
+        ...
 
 
 def predict_end(
-    linearizer: Any, factors: Any, start: StepInputs, tension: Any
+    linearizer: Any, factors: Any, start: PredictionInputs, tension: Any
 ) -> tuple[ContactLinearization, np.ndarray, np.ndarray]:
     """Predict the end of a step.
 
@@ -22,7 +52,7 @@ def predict_end(
     Args:
         linearizer: ``ContactLinearizer`` of the body, or ``IslandLinearizer``.
         factors: linear solver of the body, or those of the bodies of the island.
-        start: inputs of the step; its activations are not used.
+        start: inputs of the step.
         tension: muscles of the body, or of the bodies of the island.
 
     Returns:

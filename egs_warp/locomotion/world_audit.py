@@ -180,7 +180,7 @@ def audit_world(
     boxes = [_boxes(t, shape) for t, shape in zip(trajectories, shapes, strict=True)]
     pairs = []
     for a, b in combinations(range(len(trajectories)), 2):
-        pair = _Pair((a, b), *(tuple(each[i] for i in (a, b)) for each in (trajectories, shapes, boxes)))
+        pair = _Pair((a, b), (trajectories[a], trajectories[b]), (shapes[a], shapes[b]), (boxes[a], boxes[b]))
         if pair.meets:
             pairs.append(pair.audit(float(frictions[a, b])))
     return WorldAudit(
@@ -318,8 +318,9 @@ class _Pair:
         same = self.second_steps >= 0
         first[same] += second[self.second_steps[same]]
         second[self.second_steps[same]] = 0.0
-        sums = np.concatenate(wrenches)
-        return tuple(float(np.linalg.norm(sums[:, part], axis=1).max(initial=0.0)) for part in np.s_[:3, 3:])
+        sums = np.concatenate(wrenches).reshape(-1, 2, 3)
+        force, torque = np.linalg.norm(sums, axis=2).max(axis=0, initial=0.0).tolist()
+        return force, torque
 
     def _geometry(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the gaps (n,) m of the matched contacts at the starts of their steps, and their unit normals (n, 3) in

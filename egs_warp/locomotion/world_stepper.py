@@ -88,14 +88,15 @@ class WorldStepper:
         """
         done: list[list[StepReport]] = [[] for _ in self.bodies]
         for members in self.islands(states, dt):
-            first = self.bodies[members[0]].stepper
-            parts = [[values[i] for i in members] for values in (states, memories, objectives)]
-            if len(members) > 1:
-                with one_blas_thread(), first.factors.stream:
-                    reports = self._island(members).advance(*parts, dt)
-            else:
-                memory = _with_ground_only(memories[members[0]], self.pairs.point_counts[members[0]])
-                reports = [first.advance(parts[0][0], memory, parts[2][0], dt)[2]]
+            if len(members) == 1:
+                body = members[0]
+                memory = _with_ground_only(memories[body], self.pairs.point_counts[body])
+                _, _, done[body] = self.bodies[body].stepper.advance(states[body], memory, objectives[body], dt)
+                continue
+            with one_blas_thread():
+                reports = self._island(members).advance(
+                    [states[i] for i in members], [memories[i] for i in members], [objectives[i] for i in members], dt
+                )
             for body, each in zip(members, reports, strict=True):
                 done[body] = each
         return done

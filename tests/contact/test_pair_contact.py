@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from egs_warp.contact.detection import ContactGeometry
 from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.detection import ContactGeometry
 from egs_warp.contact.pair_contact import PairBody, PairContactDetector
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.deformation.embedding import embed_points
