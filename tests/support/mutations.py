@@ -372,6 +372,11 @@ OTHER_FORMULAS: list[Mutation] = [
             "locomotion/test_audit.py::test_a_run_that_slides_passes",
         ),
         (
+            *("world audit: the slip relative to the other body", "locomotion/world_audit.py"),
+            *("contact_displacements(t)[1][i] - contact_displacements(u)[1][j]", "contact_displacements(t)[1][i]"),
+            "locomotion/test_world_audit.py::test_a_correct_run_passes",
+        ),
+        (
             *("uneven ground: the distance from its tangent plane", "kernels/contact/height_field.py"),
             *("real(1.0) + first * first + second * second", "real(1.0) + first * first"),
             "contact/test_terrain.py::test_the_kernel_equals_its_twin",
