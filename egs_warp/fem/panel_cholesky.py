@@ -99,7 +99,7 @@ class PanelCholesky:
         self.status[select] = torch.where(is_definite, FactorStatus.DEFINITE, FactorStatus.NONE).to(torch.int8)
 
     def solve(
-        self, right: torch.Tensor, select: torch.Tensor, projection: MomentumProjection | None = None
+        self, right: torch.Tensor, select: torch.Tensor, projection: MomentumProjection[torch.Tensor] | None = None
     ) -> torch.Tensor:
         """Return S^-1 ``right`` for right-hand sides (k, n, m) of the worlds ``select`` (k,); apply ``projection`` if
         given.
