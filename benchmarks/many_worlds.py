@@ -97,14 +97,14 @@ def measure(creature: Creature, jump: np.ndarray, worlds: int, *, alone: int, pa
     )
     start = stepper.start([creature.start] * worlds)
     activations = torch.as_tensor(jump[:, None] * shares[:, None], device=device)
-    stepper.advance(start, activations[0], dt)
+    stepper.advance_with_activations(start, activations[0], dt)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     state, middle, halved = start, start, 0
     started = watch.now()
     for number, row in enumerate(activations):
         middle = state if number == len(activations) // 2 else middle
-        state, done, failed = stepper.advance(state, row, dt)
+        state, done, failed = stepper.advance_with_activations(state, row, dt)
         if bool(failed.any()):
             raise RuntimeError(f"{int(failed.sum())} worlds of {worlds} could not be solved in step {number}")
         halved += worlds - int(torch.as_tensor(done[0].report.converged).sum()) if done[0].report.dt == dt else worlds
@@ -119,7 +119,7 @@ def measure(creature: Creature, jump: np.ndarray, worlds: int, *, alone: int, pa
     }
     watch.on, started = True, watch.now()
     for row in activations[len(activations) // 2 :][:_SPLIT]:
-        middle, _, _ = stepper.advance(middle, row, dt)
+        middle, _, _ = stepper.advance_with_activations(middle, row, dt)
     whole = watch.now() - started
     split = {name: 1e3 * value / _SPLIT for name, value in watch.seconds.items()}
     split["rest"] = 1e3 * whole / _SPLIT - sum(split.values())

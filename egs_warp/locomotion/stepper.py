@@ -46,7 +46,7 @@ from egs_warp.short_repr import short_repr
 
 MAX_HALVINGS = 4
 """Maximum number of successive halvings of a step that does not converge."""
-_REPLAN_FACTOR, _REPLAN_MARGIN = 1.2, 0.01
+REPLAN_FACTOR, REPLAN_MARGIN = 1.2, 0.01
 """A step is replanned if its objectives cost more than this factor times the value that the plan expects, plus this
 margin."""
 
@@ -328,7 +328,7 @@ class LocomotionStepper:
         if (
             result.converged
             and self._objective_value(problem, objectives, result.contacts, result)
-            > _REPLAN_FACTOR * expected + _REPLAN_MARGIN
+            > REPLAN_FACTOR * expected + REPLAN_MARGIN
         ):
             plan, result = self._replan(problem, plan, result, memory, objectives, clock)
         end, after, report = self._finish(problem, plan, result, clock)

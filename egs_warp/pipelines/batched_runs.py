@@ -221,7 +221,7 @@ def _run_steps(
         for world in worlds:
             runs[world].append([])
         activations = np.stack([batch[world].activations[number] for world in worlds])
-        state, done, _ = stepper.advance(state, activations, batch[0].dt)
+        state, done, _ = stepper.advance_with_activations(state, activations, batch[0].dt)
         for step in done:
             for world, report in zip(step.worlds.tolist(), step.reports(), strict=True):
                 runs[world][-1].append(report)
