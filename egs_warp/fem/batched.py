@@ -147,11 +147,16 @@ def allocate_struct(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: 
     """Return an instance of a Warp ``struct`` with zeroed arrays on ``device``, of the given ``shapes`` by field, and
     with the arrays ``given``."""
     instance = struct()
-    for name, shape in shapes.items():
-        setattr(instance, name, wp.zeros(shape, dtype=struct.vars[name].type.dtype, device=device))
-    for name, array in given.items():
+    for name, array in (_zeroed_fields(struct, shapes, device) | given).items():
         setattr(instance, name, array)
     return instance
+
+
+def _zeroed_fields(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: wp.Device) -> dict[str, wp.array]:
+    """Return zeroed arrays of the given ``shapes`` with the element types of the fields of ``struct``."""
+    return {
+        name: wp.zeros(shape, dtype=struct.vars[name].type.dtype, device=device) for name, shape in shapes.items()
+    }
 
 
 class StructPerWorld:
@@ -173,12 +178,10 @@ class StructPerWorld:
             device: device of the arrays.
             given: arrays that all worlds share, by field.
         """
-        self._arrays = allocate_struct(
-            struct, {name: (worlds, *shape) for name, shape in shapes.items()}, device, **given
-        )
+        own = _zeroed_fields(struct, {name: (worlds, *shape) for name, shape in shapes.items()}, device)
+        self._arrays = own | given
         table = np.zeros(worlds, struct.numpy_dtype())
-        for name in shapes:
-            array = getattr(self._arrays, name)
+        for name, array in own.items():
             table[name] = array[0].__ctype__().numpy_value()
             table[name]["data"] += np.arange(worlds, dtype=np.uint64) * np.uint64(array.strides[0])
         for name, array in given.items():
