@@ -128,7 +128,7 @@ def _run_jobs(
     """Run the jobs and yield each result when it is available; batches run first."""
     if worlds is not None and worlds < 0:
         raise ArgumentError("worlds", "give the number of jobs in a batch, at least 0", value=worlds)
-    batched = [number for number, job in enumerate(jobs) if is_batchable(job)]
+    batched = [number for number, job in enumerate(jobs) if is_batchable(creature, job)]
     worlds = choose_batch_size(creature, len(batched)) if worlds is None else worlds
     batched = batched if worlds > 0 else []
     yield from run_batched(
