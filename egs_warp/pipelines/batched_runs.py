@@ -189,13 +189,13 @@ def _run(creature: Creature, batch: Sequence[_BatchJob], progress: Progress) -> 
     running = list(range(len(runs)))
     while running:
         results = [(world, *_resumed(runs[world], done.get(world))) for world in running]
+        if frames:
+            progress(dict(frames))
+            frames.clear()
         for world, kind, value in results:
             if kind == "failed" or value is not None:
                 yield TaskResult(runs[world].one.number, *((value, None) if kind == "done" else (None, value)), 1)
         running = [world for world, kind, value in results if kind == "done" and value is None]
-        if frames:
-            progress(dict(frames))
-            frames.clear()
         done = {world: [] for world in running}
         state = _advanced(stepper, state, {world: runs[world] for world in running}, done)
 

@@ -74,5 +74,5 @@ def test_bad_arguments_are_one_line() -> None:
         CreatureVectorEnv(creature, 0)
     with pytest.raises(ArgumentError, match=r"^frictions: 1 are given; give one for each of 2 worlds$"):
         CreatureVectorEnv(creature, 2, frictions=[0.5])
-    with pytest.raises(UserError, match=r"^actions 'target' are not known; did you mean targets\?"):
+    with pytest.raises(UserError, match=r"^actions 'target' are not known \(did you mean 'targets'\?\)"):
         CreatureVectorEnv(creature, 2, actions="target")

@@ -30,7 +30,9 @@ from egs_warp.pipelines.creature import Creature, initial_stance
 from tests.locomotion.test_batch import on_its_rim
 from tests.support.creatures import coarse_pawn
 
-FRICTIONS = (0.8, 0.4, 1.2)
+FRICTIONS = (0.8, 0.4, 0.6)
+"""With 1.2, the plan of a body that is pushed down amplifies rounding: a start that differs by 1e-15 m changes the
+activations of a single stepper by up to 0.09 of their bounds."""
 Goals = Callable[[BodyState, StepReport | None, float], Sequence[AnyObjective]]
 """Function of state, last report and step size that returns the objectives of a step, like that of a motion."""
 
@@ -129,7 +131,7 @@ def test_each_world_plans_as_a_single_stepper(creature: Creature, speeds: tuple[
     """Worlds with different targets and numbers of objectives."""
     made = check_runs(
         creature,
-        lambda: [rising(creature, speed, count=4 - world) for world, speed in enumerate(speeds)],
+        lambda: [rising(creature, speed, count=4 if world == 0 else 3) for world, speed in enumerate(speeds)],
         steps=3,
     )
     strengths = [np.abs(run[-1][-1].activations / creature.muscles.bounds).max() for run in made]
