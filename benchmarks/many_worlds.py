@@ -11,9 +11,10 @@ which every stage synchronises the device.
 
 With ``--planned``, each world plans a jump over its own distance (0.2 to 0.7 body heights) in a closed loop instead:
 its motion, a Python object, returns objectives for the state that the device has reached. The stage ``objectives``
-is the time of the motions and of the upload, and the rate without this stage is measured too. ``--matrices`` also times, in ms, factorisations of this number of dense
-matrices of each cage's size, with panels of several widths and with torch's own Cholesky factorisation, and solutions
-for 1 and 96 right-hand sides.
+is the time of the motions and of the upload, and the rate without this stage is measured too.
+
+``--matrices`` also times, in ms, factorisations of this number of dense matrices of each cage's size, with panels of
+several widths and with torch's own Cholesky factorisation, and solutions for 1 and 96 right-hand sides.
 
 Aims: ``many_planned`` (``--planned`` on one GPU, 2,500 steps per second with 250 nodes and 700 with 568),
 ``many_2000`` (on one GPU, 2,000 steps per second with 250 nodes and 600 with 541), ``many_alike`` (on any device,
@@ -322,7 +323,9 @@ def summary(rows: list[Row], device: str) -> dict[str, Any]:
     for name, required, planned in (("many_2000", AIMS, False), ("many_planned", PLANNED_AIMS, True)):
         chosen = [row for row in rows if row.get("planned", False) is planned]
         best = {
-            nodes: max((row["rate"] for row in chosen if abs(row["nodes"] - nodes) <= NODE_TOLERANCE * nodes), default=0)
+            nodes: max(
+                (row["rate"] for row in chosen if abs(row["nodes"] - nodes) <= NODE_TOLERANCE * nodes), default=0
+            )
             for nodes in required
         }
         why[name] = "needs a GPU" if device == "cpu" else "needs runs of both cages"

@@ -24,7 +24,7 @@ try:
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise UserError("environments need Gymnasium; run: pip install 'egs-warp[gymnasium]'") from error
+    raise UserError("environments: Gymnasium is not installed; pip install 'egs-warp[gymnasium]'") from error
 
 CENTRE_WEIGHT, MOMENTUM_WEIGHT, SHAPE_WEIGHT = 2.0, 1.0, 0.1
 """Weights of the objectives of the actions ``targets``: velocity of the centre of mass, angular momentum, and
@@ -143,9 +143,7 @@ class CreatureVectorEnv(VectorEnv):
         self._measurement = self._measured()
         return self._measurement.vectors, {}
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance all worlds by one frame under the ``actions`` (B, ...).
 
         Returns:
@@ -191,8 +189,8 @@ class CreatureVectorEnv(VectorEnv):
             if self.actions is Actions.TARGETS:
                 active, _, lost = self._stepper.advance(before, self._objectives(values[before.worlds]), self._dt)
             else:
-                wanted = self._activations(before, values[before.worlds])
-                active, _, lost = self._stepper.advance_with_activations(before, wanted, self._dt)
+                desired = self._activations(before, values[before.worlds])
+                active, _, lost = self._stepper.advance_with_activations(before, desired, self._dt)
             failed[before.worlds[lost]] = True
             left.append(before.gather(lost.nonzero().squeeze(1)))
         for part in left:
@@ -200,15 +198,15 @@ class CreatureVectorEnv(VectorEnv):
         self._state = active
         return failed.cpu().numpy()
 
-    def _activations(self, state: BatchState, wanted: torch.Tensor) -> torch.Tensor:
-        """Return (c, M) m, the activations of all muscles nearest to those ``wanted`` (c, m) of the synergies that
+    def _activations(self, state: BatchState, desired: torch.Tensor) -> torch.Tensor:
+        """Return (c, M) m, the activations of all muscles nearest to those ``desired`` (c, m) of the synergies that
         their maximum rate allows."""
         lower, upper = self._planner.activation_bounds(state.activations @ self._means, self._dt)
-        return torch.maximum(torch.minimum(wanted, upper), lower) @ self._members.T
+        return torch.maximum(torch.minimum(desired, upper), lower) @ self._members.T
 
     def _target_rows(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the rows of the objectives of ``Actions.TARGETS``, times sqrt(2 weight): (3, 3N) of the centre of mass,
-        and (3N,) entries of the nodes."""
+        """Return the rows of the objectives of ``Actions.TARGETS``, times sqrt(2 weight): (3, 3N) of the centre of
+        mass, and (3N,) entries of the nodes."""
         body = self.creature.body
         rows = np.sqrt(2.0 * CENTRE_WEIGHT) * np.asarray(body.mean_rows)
         shares = np.sqrt(2.0 * SHAPE_WEIGHT) * body.mass_roots

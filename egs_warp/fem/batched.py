@@ -143,20 +143,18 @@ def _array(value: Any) -> Any:
     return as_warp(*value) if isinstance(value, tuple) else value
 
 
-def allocate_struct(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: wp.Device, **given: wp.array) -> Any:
+def allocate_struct(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: wp.Device, **arrays: wp.array) -> Any:
     """Return an instance of a Warp ``struct`` with zeroed arrays on ``device``, of the given ``shapes`` by field, and
-    with the arrays ``given``."""
+    with the given ``arrays``."""
     instance = struct()
-    for name, array in (_zeroed_fields(struct, shapes, device) | given).items():
+    for name, array in (_zeroed_fields(struct, shapes, device) | arrays).items():
         setattr(instance, name, array)
     return instance
 
 
 def _zeroed_fields(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: wp.Device) -> dict[str, wp.array]:
     """Return zeroed arrays of the given ``shapes`` with the element types of the fields of ``struct``."""
-    return {
-        name: wp.zeros(shape, dtype=struct.vars[name].type.dtype, device=device) for name, shape in shapes.items()
-    }
+    return {name: wp.zeros(shape, dtype=struct.vars[name].type.dtype, device=device) for name, shape in shapes.items()}
 
 
 class StructPerWorld:
@@ -167,7 +165,7 @@ class StructPerWorld:
     """
 
     def __init__(
-        self, struct: Any, shapes: Mapping[str, tuple[int, ...]], worlds: int, device: wp.Device, **given: wp.array
+        self, struct: Any, shapes: Mapping[str, tuple[int, ...]], worlds: int, device: wp.Device, **arrays: wp.array
     ) -> None:
         """Allocate zeroed arrays.
 
@@ -176,14 +174,14 @@ class StructPerWorld:
             shapes: shape of each array in one world, by field.
             worlds: number of worlds B.
             device: device of the arrays.
-            given: arrays that all worlds share, by field.
+            arrays: arrays that all worlds share, by field.
         """
         own = _zeroed_fields(struct, {name: (worlds, *shape) for name, shape in shapes.items()}, device)
-        self._arrays = own | given
+        self._arrays = own | arrays  # The structs hold only addresses.
         table = np.zeros(worlds, struct.numpy_dtype())
         for name, array in own.items():
             table[name] = array[0].__ctype__().numpy_value()
             table[name]["data"] += np.arange(worlds, dtype=np.uint64) * np.uint64(array.strides[0])
-        for name, array in given.items():
+        for name, array in arrays.items():
             table[name] = array.__ctype__().numpy_value()
         self.structs = wp.array(table, dtype=struct, device=device)

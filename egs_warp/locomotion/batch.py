@@ -192,9 +192,7 @@ class BatchStepper:
             planned = torch.as_tensor(step.report.activations)[repeated]
             after, done, half_failed = self._best_half_steps(start, planned, objectives.subset(repeated), dt)
             failed[repeated[half_failed]] = True
-            return self._solved(
-                state, merged(step.after.subset(solved), after), [step.subset(solved), *done], failed
-            )
+            return self._solved(state, merged(step.after.subset(solved), after), [step.subset(solved), *done], failed)
 
     def advance_with_activations(
         self, state: BatchState, activations: np.ndarray | torch.Tensor, dt: float

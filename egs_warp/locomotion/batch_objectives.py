@@ -52,9 +52,7 @@ class BatchObjectives(BatchedRecord):
             upload(loads),
         )
 
-    def form(
-        self, problem: BatchProblem, contacts: ContactSet, velocities: torch.Tensor, m: int
-    ) -> torch.Tensor:
+    def form(self, problem: BatchProblem, contacts: ContactSet, velocities: torch.Tensor, m: int) -> torch.Tensor:
         """Return the quadratic form (c, k + 1, k + 1) of their cost in (x, 1), see ``step_cost.objectives_cost``.
 
         Args:

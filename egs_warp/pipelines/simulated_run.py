@@ -11,7 +11,15 @@ import numpy as np
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.locomotion.rollout import FRAME_RATE, REST_FRAMES, RolloutResult, RunSteps, rollout_steps, run_with, solver_steps
+from egs_warp.locomotion.rollout import (
+    FRAME_RATE,
+    REST_FRAMES,
+    RolloutResult,
+    RunSteps,
+    rollout_steps,
+    run_with,
+    solver_steps,
+)
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.push import Push, PushKicks
