@@ -323,9 +323,7 @@ def summary(rows: list[Row], device: str) -> dict[str, Any]:
     for name, required, planned in (("many_2000", AIMS, False), ("many_planned", PLANNED_AIMS, True)):
         chosen = [row for row in rows if row.get("planned", False) is planned]
         best = {
-            nodes: max(
-                (row["rate"] for row in chosen if abs(row["nodes"] - nodes) <= NODE_TOLERANCE * nodes), default=0
-            )
+            nodes: max([0.0, *(row["rate"] for row in chosen if abs(row["nodes"] / nodes - 1.0) <= NODE_TOLERANCE)])
             for nodes in required
         }
         why[name] = "needs a GPU" if device == "cpu" else "needs runs of both cages"

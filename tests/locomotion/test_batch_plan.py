@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.fem.body import BodyState
+from egs_warp.kernels.locomotion.active_set import NUMERICAL_FAILURE
 from egs_warp.locomotion import batch, batch_search, strategies
 from egs_warp.locomotion import stepper as stepping
 from egs_warp.locomotion.batch import BatchStepper
@@ -155,16 +157,15 @@ def test_failed_searches_are_repeated_on_the_host(creature: Creature, monkeypatc
     """If the kernel fails numerically, the plan is that of the host."""
     goals = [rising(creature, 0.3), rising(creature, 0.1)]
     asked, dt = [each(creature.start, None, 0.0) for each in goals], solver_steps(creature.body)[0]
-    ends = []
+    run, ends = batch_search.SearchPool.run, []
+
+    def failing(pool: batch_search.SearchPool, packed: wp.array, result: wp.array, *others: wp.array) -> None:
+        run(pool, packed, result, *others)
+        result.numpy()[:, 0] = NUMERICAL_FAILURE
+
     for fails in (False, True):
         stepper = batch_stepper(creature, FRICTIONS[:2])
         if fails:
-            run = batch_search.SearchPool.run
-
-            def failing(pool: batch_search.SearchPool, packed: object, result: object, *others: object) -> None:
-                run(pool, packed, result, *others)
-                result.numpy()[:, 0] = 2.0
-
             monkeypatch.setattr(batch_search.SearchPool, "run", failing)
         state, _, failed = stepper.advance(stepper.start([creature.start] * 2), asked, dt)
         assert not failed.any()
