@@ -31,7 +31,6 @@ def main(arguments: list[str] | None = None) -> list[float]:
     parser.add_argument("--generations", type=int, default=4)
     parser.add_argument("--frames", type=int, default=30, help="frames of each candidate, at 60 Hz")
     parser.add_argument("--nodes", type=int, default=50, help="requested number of nodes of the cage")
-    parser.add_argument("--gaussians", type=int, default=3000)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
     if chosen.worlds < 4:
@@ -39,7 +38,7 @@ def main(arguments: list[str] | None = None) -> list[float]:
     from egs_warp.environments.vector import CreatureVectorEnv
 
     egs.use_device(chosen.device)
-    scene = egs.scene("pawn", gaussian_count=chosen.gaussians, device=chosen.device)
+    scene = egs.scene("pawn", device=chosen.device)
     creature = egs.make_creature(scene.object, plane=scene.plane, options=egs.CreatureOptions(nodes=chosen.nodes))
     worlds = CreatureVectorEnv(creature, chosen.worlds, actions="targets", frames=chosen.frames + 1)
     rng, mean, spread = np.random.default_rng(0), MEAN, SPREAD
