@@ -20,7 +20,8 @@ from egs_warp.locomotion.rollout import RunSteps, StepRequest, solver_steps
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.strategies import Strategy
-from egs_warp.pipelines.creature import Creature, checked_friction
+from egs_warp.pipelines.captured_body import checked_friction
+from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.job import Job, RunSummary
 from egs_warp.pipelines.simulated_run import SimulatedRun
 from egs_warp.pipelines.worker_pool import ProgressCallback, TaskResult, run_task
