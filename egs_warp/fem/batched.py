@@ -178,7 +178,7 @@ class StructPerWorld:
         """
         own = _zeroed_fields(struct, {name: (worlds, *shape) for name, shape in shapes.items()}, device)
         self._arrays = own | arrays  # The structs hold only addresses.
-        table = np.zeros(worlds, struct.numpy_dtype())
+        table: Any = np.zeros(worlds, struct.numpy_dtype())
         for name, array in own.items():
             table[name] = array[0].__ctype__().numpy_value()
             table[name]["data"] += np.arange(worlds, dtype=np.uint64) * np.uint64(array.strides[0])

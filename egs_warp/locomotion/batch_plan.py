@@ -127,7 +127,7 @@ class BatchPlanner:
         with self._stages("program"):
             for first in range(0, len(last), self._chunk):
                 part = torch.arange(first, min(first + self._chunk, len(last)), device=last.device)
-                terms = (each.subset(part) for each in (inputs, predicted, objectives))
+                terms = inputs.subset(part), predicted.subset(part), objectives.subset(part)
                 at = slice(first, first + len(part))
                 is_definite[at] = self._write_program(*terms, last[at], velocities[at], form[at])
             previous, start = ((each / self._bounds) @ self._means for each in (last, predicted.activations))

@@ -220,7 +220,10 @@ def _active_set_shapes(rows: int, base_rows: int, unknowns: int) -> dict[Any, di
     """Return ``UnitConstraints``, ``ActiveSet`` and ``Splitting`` with their shapes, see ``active_set_shapes``."""
     row_shapes, state_shapes = active_set_shapes(rows, base_rows, unknowns)
     names = "rows", "projected", "multipliers", "sums", "right", "between", "step"
-    shapes = dict.fromkeys(names, (unknowns,)) | dict.fromkeys(("initial_values", "all_multipliers"), (rows,))
+    shapes: dict[str, tuple[int, ...]] = {
+        **dict.fromkeys(names, (unknowns,)),
+        **dict.fromkeys(("initial_values", "all_multipliers"), (rows,)),
+    }
     return {UnitConstraints: row_shapes, ActiveSet: state_shapes, Splitting: shapes}
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -230,7 +230,7 @@ def _unsolvable() -> RunSteps[SimulatedRun]:
     yield
 
 
-def _resumed(run: _Run, done: list[StepReport] | None) -> tuple[str, RunSummary | str | None]:
+def _resumed(run: _Run, done: list[StepReport] | None) -> tuple[str, Any]:
     """Continue ``run``; return ``done`` and its summary or None, or ``failed`` and the reason in one line."""
     return run_task(partial(run.resume, done), run.one.job, _no_progress)
 
