@@ -99,7 +99,7 @@ class BatchBody:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BatchProblem(ImplicitStep):
+class BatchProblem(ImplicitStep[torch.Tensor]):
     """The implicit steps of c worlds, with tensors on the device of the body."""
 
     worlds: BatchBody
@@ -272,8 +272,8 @@ def enqueue_step_start(
 
 
 def apply_inverse(
-    problem: BatchProblem, impulses: torch.Tensor, projection: MomentumProjection | None = None
-) -> tuple[torch.Tensor, MomentumProjection]:
+    problem: BatchProblem, impulses: torch.Tensor, projection: MomentumProjection[torch.Tensor] | None = None
+) -> tuple[torch.Tensor, MomentumProjection[torch.Tensor]]:
     """Return the velocity changes J^-1 ``impulses`` and the momentum projection that was used.
 
     Args:

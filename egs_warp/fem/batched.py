@@ -9,7 +9,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Self
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
 
 import numpy as np
 import warp as wp
@@ -18,6 +19,11 @@ from egs_warp.launching import launch_cached
 
 if TYPE_CHECKING:
     import torch
+
+Array: TypeAlias = "np.ndarray | torch.Tensor"
+"""A NumPy array or a PyTorch tensor."""
+ArrayT = TypeVar("ArrayT", "np.ndarray", "torch.Tensor")
+"""Type of the arrays of a record or a function: either all are NumPy arrays, or all are PyTorch tensors."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +63,7 @@ class BatchedRecord:
         return [(name, value) for name, value in values if isinstance(value, BatchedRecord) or hasattr(value, "ndim")]
 
 
-def _rows(value: Any, worlds: torch.Tensor) -> Any:
+def _rows(value: BatchedRecord | torch.Tensor, worlds: torch.Tensor) -> BatchedRecord | torch.Tensor:
     return value.gather(worlds) if isinstance(value, BatchedRecord) else value[worlds]
 
 
@@ -65,7 +71,7 @@ def _rows_on_host(value: torch.Tensor) -> list[Any]:
     return value.tolist() if value.ndim == 1 else list(value.cpu().numpy())
 
 
-def _count(value: Any) -> int:
+def _count(value: BatchedRecord | torch.Tensor) -> int:
     return _count(next(iter(value.batched_fields()))[1]) if isinstance(value, BatchedRecord) else len(value)
 
 
@@ -74,17 +80,17 @@ def nonzero(mask: torch.Tensor) -> torch.Tensor:
     return mask.nonzero().squeeze(1)
 
 
-def array_module(values: Any) -> Any:
+def array_module(values: Array) -> ModuleType:
     """Return the module, NumPy or PyTorch, whose functions accept ``values``."""
     return np if isinstance(values, np.ndarray) else sys.modules["torch"]
 
 
-def empty_like(values: Any, shape: tuple[int, ...]) -> Any:
+def empty_like(values: ArrayT, shape: tuple[int, ...]) -> ArrayT:
     """Return an uninitialized array of ``shape``, of the kind, type and device of ``values``."""
     return np.empty(shape, values.dtype) if isinstance(values, np.ndarray) else values.new_empty(shape)
 
 
-def padded(values: Any, more: int) -> Any:
+def padded(values: torch.Tensor, more: int) -> torch.Tensor:
     """Pad the tensor ``values`` (c, K, ...) with ``more`` zeros along the second axis."""
     if not more:
         return values
@@ -93,7 +99,7 @@ def padded(values: Any, more: int) -> Any:
     return wide
 
 
-def contiguous(values: Any) -> Any:
+def contiguous(values: ArrayT) -> ArrayT:
     """Return ``values``, or a contiguous copy; a NumPy array is also converted to int32 or float64."""
     if isinstance(values, np.ndarray):
         return np.ascontiguousarray(values, np.int32 if values.dtype.kind == "i" else np.float64)
@@ -101,7 +107,7 @@ def contiguous(values: Any) -> Any:
 
 
 def launch_on(
-    target: Any,
+    target: Array,
     kernel: Any,
     dim: int | tuple[int, ...],
     *,
@@ -112,7 +118,7 @@ def launch_on(
     """Launch ``kernel`` on the device of ``target``.
 
     Args:
-        target: a NumPy array, a tensor, or a PyTorch device.
+        target: any array or tensor on the device.
         kernel: the Warp kernel.
         dim: launch dimensions.
         inputs: arguments; a contiguous array or tensor is given as a pair (array, element type).
@@ -123,11 +129,11 @@ def launch_on(
     if isinstance(target, np.ndarray):
         launch_cached(kernel, dim, inputs=input_arrays, outputs=output_arrays, device=wp.get_device("cpu"))
         return
-    device = wp.device_from_torch(getattr(target, "device", target))
+    device = wp.device_from_torch(target.device)
     wp.launch(kernel, dim, inputs=input_arrays, outputs=output_arrays, device=device, block_dim=block_dim)
 
 
-def as_warp(values: Any, dtype: Any) -> wp.array:
+def as_warp(values: Array, dtype: type) -> wp.array:
     """Return a Warp array that shares the memory of ``values``, a tensor or a NumPy array."""
     if isinstance(values, np.ndarray):
         return wp.array(values, dtype=dtype, device="cpu", copy=False)

@@ -68,7 +68,7 @@ class LinearSolver(Protocol):
         """
         ...
 
-    def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
+    def solve(self, right: np.ndarray, projection: MomentumProjection[np.ndarray] | None = None) -> np.ndarray:
         """Solve for ``right`` (n,) or for each column of (n, m); apply ``projection`` if given."""
         ...
 

@@ -107,7 +107,7 @@ class PanelCholesky:
         return matrices.view(-1, self.size, self.size)
 
     def solve(
-        self, right: torch.Tensor, select: torch.Tensor, projection: MomentumProjection | None = None
+        self, right: torch.Tensor, select: torch.Tensor, projection: MomentumProjection[torch.Tensor] | None = None
     ) -> torch.Tensor:
         """Return S^-1 ``right`` for right-hand sides (k, n, m) of the worlds ``select`` (k,); apply ``projection`` if
         given.

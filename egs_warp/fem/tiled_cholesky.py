@@ -149,7 +149,7 @@ class TiledCholesky:
             self._finite = finite > 0.0
             self._status = FactorStatus.DEFINITE if self._finite and definite > 0.0 else FactorStatus.NONE
 
-    def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
+    def solve(self, right: np.ndarray, projection: MomentumProjection[np.ndarray] | None = None) -> np.ndarray:
         """Solve for ``right``; see ``LinearSolver.solve``."""
         assert self.status is FactorStatus.DEFINITE, "call factor() first"
         with self.stream:

@@ -115,7 +115,7 @@ def _start_points(t: Trajectory) -> np.ndarray:
 def _start_gaps(t: Trajectory) -> np.ndarray:
     """Return (C,) m, distance of each contact from its plane, or from the tangent plane of uneven ground, at the start
     of its step."""
-    planes = t.planes[t.contact_plane]
+    planes = t.planes[np.maximum(t.contact_plane, 0)]
     points = _start_points(t)
     gaps = np.einsum("ci,ci->c", planes[:, :3], points) + planes[:, 3]
     uneven = _on_uneven_ground(t)
