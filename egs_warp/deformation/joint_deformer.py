@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -43,7 +44,7 @@ class JointDeformer:
         return deformed
 
 
-def _copy_rows(target: wp.array, source: wp.array, first: int) -> None:
+def _copy_rows(target: Any, source: wp.array, first: int) -> None:
     """Copy the rows of ``source`` into ``target``, beginning at the row ``first``."""
     rows = target[first : first + source.shape[0]]
     wp.copy(rows if rows.ndim == 1 else rows[:, : source.shape[1]], source)
@@ -52,7 +53,7 @@ def _copy_rows(target: wp.array, source: wp.array, first: int) -> None:
 def _with_bands(cloud: GaussianCloud, degree: int) -> GaussianCloud:
     """Return ``cloud`` with the colour bands up to ``degree``, added ones zero."""
     sh = with_degree(cloud, degree).sh.numpy()
-    missing = (degree + 1) ** 2 - sh.shape[1]
+    missing = (degree + 1) ** 2 - (cloud.sh_degree + 1) ** 2
     if missing == 0:
         return cloud
     return replace(cloud, sh=wp.array(np.pad(sh, ((0, 0), (0, missing), (0, 0))), dtype=wp.vec3, device=cloud.device))

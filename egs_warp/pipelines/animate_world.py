@@ -90,7 +90,7 @@ def write_world(
     film: bool = True,
     shot: Shot | None = None,
     size: int = 512,
-    view_from: Sequence[float] | None = None,
+    view_from: Sequence[float] | np.ndarray | None = None,
     shadow: bool = True,
     overwrite: bool = False,
     quiet: bool = False,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -109,7 +110,8 @@ class ObstacleShadows:
             colours[rows] *= 1.0 - shadow.cover(shadow.of(bodies), texels, strength).numpy()[:, None]
         sh = np.zeros((len(colours), joint.sh.shape[1], 3), np.float32)
         sh[:, 0] = _band_0(colours)
-        wp.copy(joint.sh[first:], wp.array(sh, dtype=wp.vec3, device=joint.device))
+        rows: Any = joint.sh[first:]
+        wp.copy(rows, wp.array(sh, dtype=wp.vec3, device=joint.device))
 
 
 def _band_0(colours: np.ndarray) -> np.ndarray:

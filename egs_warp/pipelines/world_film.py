@@ -89,7 +89,7 @@ def _outline(result: BodyResult) -> np.ndarray:
     return np.einsum("pw,fwi->fpi", body.geometry.weights[extreme], positions[:, body.mesh.tets[0]])
 
 
-def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | None = None) -> Camera:
+def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | np.ndarray | None = None) -> Camera:
     """Return a fixed camera that shows all bodies, and obstacles near them, during the whole run.
 
     By default it looks from the direction in which the bodies hide each other least and the creatures face the camera.
@@ -128,7 +128,7 @@ def draw_world_film(
     name: str = "world",
     size: int = 512,
     shot: Shot | None = None,
-    view_from: Sequence[float] | None = None,
+    view_from: Sequence[float] | np.ndarray | None = None,
     shadow: bool = True,
     quiet: bool = False,
 ) -> WorldFilm:
@@ -201,7 +201,7 @@ def _clearest_view(run: WorldRun) -> np.ndarray:
         separation = float(np.minimum(apart / reach[:, None], 1.0).mean()) if len(first) else 1.0
         level = float((apart / np.maximum(np.linalg.norm(between, axis=2), 1e-9)).mean()) if len(first) else 1.0
         # A three-quarter view shows a face best.
-        facing = float(np.mean([min(face @ towards, 0.8) for face in faces])) if faces else 0.0
+        facing = float(np.minimum(np.array(faces) @ towards, 0.8).mean()) if faces else 0.0
         score = separation + _LEVEL_WEIGHT * level + _FACING_WEIGHT * facing
         if score > best_score:
             best, best_score = angle, score

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,9 +26,10 @@ from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.end_state import EndCause
 from egs_warp.pipelines.prop import Prop
 from egs_warp.pipelines.simulated_run import BodyResult, Performer, SimulatedRun, check_frames
-from egs_warp.pipelines.world import PlacedBody, World
+from egs_warp.pipelines.world import BodyKey, PlacedBody, World
 from egs_warp.short_repr import short_repr
 
+OtherKey = TypeVar("OtherKey", bound=PlacedBody | str)
 STANDING = "stand"
 """Motion of a creature without one."""
 _PROP_TIME = 10.0
@@ -119,13 +121,13 @@ class PassiveMotion:
 
 def simulate_world(
     world: World,
-    motions: Mapping[PlacedBody | str, Script | str],
+    motions: Mapping[BodyKey, Script | str],
     *,
     frames: int | None = None,
     max_seconds: float | None = None,
     step: float | None = None,
     style: Style | None = None,
-    pushes: Mapping[PlacedBody | str, Sequence[Push]] | None = None,
+    pushes: Mapping[OtherKey, Sequence[Push]] | None = None,
     get_up: bool = True,
     progress: Callable[[int, int], object] = lambda done, expected: None,
 ) -> WorldRun:
@@ -134,7 +136,7 @@ def simulate_world(
     if not world.members:
         raise UserError("world: it has no body; add a creature or a prop")
     scripts = world.by_name(motions, "motion")
-    pushes_on = world.by_name(pushes or {}, "pushes")
+    pushes_on = {} if pushes is None else world.by_name(pushes, "pushes")
     for name in [*scripts, *pushes_on]:
         if isinstance(world.member(name).body, Prop):
             raise UserError(f"{name}: it is a prop, which has no muscles and no motion; make it with make_creature")
