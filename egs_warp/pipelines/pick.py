@@ -26,8 +26,9 @@ from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.plane_search import find_planes
 from egs_warp.segmentation.table_top import planes_below, surface_around
 
-_MAX_TILT = 10.0
-"""Maximum tilt of a ground relative to the up direction that follows from cameras, degrees, as in ``locate_plane``."""
+_MAX_TILT, _MAX_TILT_OF_CAMERAS = 25.0, 10.0
+"""Maximum tilt of a ground relative to an up direction, and to one that follows from cameras, degrees, as in
+``locate_plane``."""
 _MAX_OUTSIDE = 0.02
 """Share of the opaque Gaussians, averaged over the photos, that may lie outside the frames of a capture that contains
 only one object. It is 0 to 0.003 for an object on a white desk or a turntable, and 0.29 to 0.65 for rooms."""
@@ -263,8 +264,7 @@ def _is_alone(cloud: GaussianCloud, outside: np.ndarray | None) -> bool:
 def _wide_plane(graph: ClickGraph, up: np.ndarray, opaque: np.ndarray, middle: np.ndarray | None) -> Plane | None:
     """Return the widest plane that can be the ground of a scene, below ``middle`` (3,) if that is known; None if there
     is none."""
-    tilt = {} if middle is None else {"tilt_degrees": _MAX_TILT}
-    for one in find_planes(graph.cloud, up, **tilt):
+    for one in find_planes(graph.cloud, up, tilt_degrees=_MAX_TILT if middle is None else _MAX_TILT_OF_CAMERAS):
         if one.support <= _MIN_SUPPORT or not opaque.any():
             return None
         heights = one.plane.heights(graph.means[opaque])

@@ -61,7 +61,10 @@ def outside_frames(means: np.ndarray, point: np.ndarray, cameras: Sequence[Camer
     if len(showing) < _MIN_PHOTOS:
         return None
     showing = showing[:: -(-len(showing) // _MAX_PHOTOS)]
-    return 1.0 - sum(_in_frame(means, camera).astype(np.float64) for camera in showing) / len(showing)
+    inside = np.zeros(len(means))
+    for camera in showing:
+        inside += _in_frame(means, camera)
+    return 1.0 - inside / len(showing)
 
 
 def _in_frame(points: np.ndarray, camera: Camera) -> np.ndarray:
