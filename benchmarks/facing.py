@@ -20,7 +20,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera_ring import ring_camera
 from egs_warp.io.video import contact_sheet
-from egs_warp.pipelines.creature import PlacedCage, choose_front, place_cage
+from egs_warp.pipelines.placed_cage import PlacedCage, choose_front, place_cage
 from egs_warp.render.rasteriser import render_gaussians
 from harness import Row, Table, data_folder, flags, report
 from modelled import MODELLED, UNSEEN, modelled

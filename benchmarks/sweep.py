@@ -30,7 +30,8 @@ from egs_warp.io import read_capture
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import CreatureOptions, initial_stance, make_creature, place_cage
+from egs_warp.pipelines.creature import CreatureOptions, initial_stance, make_creature
+from egs_warp.pipelines.placed_cage import place_cage
 from egs_warp.pipelines.simulated_run import simulate
 from harness import Row, Table, data_folder, flags, record, report, rows_of, timed, workers_flag
 

@@ -43,14 +43,20 @@ if TYPE_CHECKING:
     from egs_warp.motions.sequence import BodyMotion
     from egs_warp.motions.style import Style, read_style
     from egs_warp.pipelines.animate import AnimateOptions, animate
+    from egs_warp.pipelines.animate_world import WorldReport, write_world
     from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
     from egs_warp.pipelines.job import Job
     from egs_warp.pipelines.many import JobResult, simulate_many
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
+    from egs_warp.pipelines.prop import Prop, make_prop
     from egs_warp.pipelines.report import Report
     from egs_warp.pipelines.shot import Shot
-    from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
+    from egs_warp.pipelines.simulated_run import SimulatedRun
+    from egs_warp.pipelines.simulation import simulate
     from egs_warp.pipelines.train_capture import TrainResult, train
+    from egs_warp.pipelines.world import PlacedBody, World
+    from egs_warp.pipelines.world_file import WorldScript, read_world
+    from egs_warp.pipelines.world_run import WorldRun
     from egs_warp.render.autograd import render_torch
     from egs_warp.render.rasteriser import render_gaussians
     from egs_warp.segmentation.clearance import ExtentMeasure, StraddlingOptions, StraddlingPolicy
@@ -100,14 +106,20 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "motions.sequence": ("BodyMotion",),
     "motions.style": ("Style", "read_style"),
     "pipelines.animate": ("AnimateOptions", "animate"),
+    "pipelines.animate_world": ("WorldReport", "write_world"),
     "pipelines.creature": ("Creature", "CreatureOptions", "make_creature"),
     "pipelines.job": ("Job",),
     "pipelines.many": ("JobResult", "simulate_many"),
-    "pipelines.simulated_run": ("SimulatedRun", "simulate"),
+    "pipelines.simulated_run": ("SimulatedRun",),
+    "pipelines.simulation": ("simulate",),
     "pipelines.prepare_scene": ("PreparedScene", "SceneOptions", "prepare_scene"),
+    "pipelines.prop": ("Prop", "make_prop"),
     "pipelines.report": ("Report",),
     "pipelines.shot": ("Shot",),
     "pipelines.train_capture": ("TrainResult", "train"),
+    "pipelines.world": ("PlacedBody", "World"),
+    "pipelines.world_file": ("WorldScript", "read_world"),
+    "pipelines.world_run": ("WorldRun",),
     "render.autograd": ("render_torch",),
     "render.rasteriser": ("render_gaussians",),
     "segmentation.clearance": ("StraddlingPolicy", "StraddlingOptions", "ExtentMeasure"),
@@ -156,8 +168,10 @@ __all__ = [
     "MainLight",
     "MaskedView",
     "ObjectSpec",
+    "PlacedBody",
     "Plane",
     "PreparedScene",
+    "Prop",
     "Push",
     "Quantity",
     "Report",
@@ -177,6 +191,10 @@ __all__ = [
     "Trajectory",
     "UserError",
     "VideoWriter",
+    "World",
+    "WorldReport",
+    "WorldRun",
+    "WorldScript",
     "__version__",
     "animate",
     "click_at",
@@ -190,6 +208,7 @@ __all__ = [
     "inpainter_by_name",
     "keyframe_script",
     "make_creature",
+    "make_prop",
     "motion",
     "one_line_errors",
     "own_script",
@@ -199,6 +218,7 @@ __all__ = [
     "read_capture",
     "read_pushes",
     "read_style",
+    "read_world",
     "render_gaussians",
     "render_torch",
     "render_views",
@@ -211,6 +231,7 @@ __all__ = [
     "writable_folder",
     "write_ply",
     "write_png",
+    "write_world",
 ]
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from egs_warp.commands.animate_world import animate_world, is_world
 from egs_warp.commands.camera_flags import add_camera_flags, shot_of
 from egs_warp.commands.config import NAME, add_config_flag, changed_capture, write_config
 from egs_warp.commands.flags import (
@@ -61,10 +62,15 @@ def add_parser(commands: Commands) -> None:
     animate = commands.add_parser(
         "animate", help="bring a capture to life", usage="%(prog)s capture --out FOLDER [flags]"
     )
-    animate.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
+    animate.add_argument(
+        "capture",
+        help=".ply, compressed .ply, .spz, .splat, .sog, .glb, an unbundled SOG folder, or a world.yaml with several"
+        " bodies (docs/guide/worlds.md)",
+    )
     common = animate.add_argument_group("most used")
     common.add_argument(
         "--out",
+        "-o",
         required=True,
         type=named_path,
         metavar="FOLDER",
@@ -206,6 +212,9 @@ def complete_help(parser: argparse.ArgumentParser) -> None:
 def _animate(args: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import check_run_folder
 
+    if is_world(args.capture):
+        check_run_folder(args.out, overwrite=args.overwrite, writes=("sheet.png", "report.json"))
+        return EXIT_NOT_AS_REQUESTED if animate_world(args) else 0
     check_run_folder(args.out, overwrite=args.overwrite, writes=_WRITES)
     if args.config is not None and changed_capture(args.config, args.capture):
         print_note(f"{args.capture} differs from the capture of the run in {args.config}; the result will differ")

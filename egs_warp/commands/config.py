@@ -123,25 +123,9 @@ def _actions(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:
 
 
 def _read(path: Path) -> dict[Any, Any]:
-    import yaml
+    from egs_warp.io.yaml_file import read_yaml
 
-    from egs_warp.io.text import read_text
-
-    class Plain(yaml.SafeLoader):
-        """YAML loader without aliases, because a few lines of nested aliases can expand beyond the available memory."""
-
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            if self.check_event(yaml.AliasEvent):
-                where = self.peek_event().start_mark
-                raise yaml.MarkedYAMLError(problem="an alias, *name; write out what it stands for", problem_mark=where)
-            return super().compose_node(parent, index)
-
-    try:
-        tree = yaml.load(read_text(path), Plain)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        if isinstance(error, UserError):
-            raise
-        raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); correct it") from error
+    tree, _ = read_yaml(path)
     if not isinstance(tree, dict):
         raise UserError(f"{path}: no keys and values; write one flag per line, such as motion: jump")
     return tree

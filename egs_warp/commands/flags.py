@@ -159,6 +159,6 @@ def parse_plane(text: str) -> Plane:
 
 def guessed_up(capture: GaussianCloud) -> tuple[np.ndarray, str]:
     """Estimate the up direction of a capture; return the (3,) unit vector and a note for the user."""
-    from egs_warp.pipelines.creature import estimated_up
+    from egs_warp.pipelines.placed_cage import estimated_up
 
     return estimated_up(capture, advice="give --up")

@@ -43,7 +43,8 @@ def _muscles(args: argparse.Namespace) -> int:
     from egs_warp.io import read_capture
     from egs_warp.muscles.plot import check_picture_name, plot_muscles
     from egs_warp.pipelines.balance import own_muscles_notes
-    from egs_warp.pipelines.creature import body_muscles, check_front, choose_front, place_cage
+    from egs_warp.pipelines.creature import body_muscles
+    from egs_warp.pipelines.placed_cage import check_front, choose_front, place_cage
     from egs_warp.pipelines.progress import info_bar
 
     start_device("cpu")

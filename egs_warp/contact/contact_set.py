@@ -1,8 +1,9 @@
 """The contacts of a step, in one world or in many, and the products with their Jacobian W (Eq. 8).
 
 A contact consists of a surface point that moves with the four nodes of its tetrahedron, and a frame of a unit normal
-and two unit tangents. W maps nodal velocities to contact velocities in these frames; W^T maps contact forces to nodal
-forces.
+and two unit tangents. If the point touches another body, a second tetrahedron with negative weights follows, so that
+the contact velocity is relative to that body. W maps nodal velocities to contact velocities in these frames; W^T maps
+contact forces to nodal forces.
 
 ``ContactSet`` is the record of contacts for one world on the host, one world on a GPU, and many worlds. Its arrays are
 NumPy arrays or PyTorch tensors; the kernels in ``kernels/contact/contacts.py`` accept both without copying.
@@ -34,15 +35,18 @@ class ContactSet(BatchedRecord):
     points: Any
     """(n,) or (B, K) int, indices into the geometry's points."""
     nodes: Any
-    """(n, 4) or (B, K, 4) int32, nodes of each point's tetrahedron."""
+    """(n, 4) or (B, K, 4) int32, nodes of each point's tetrahedron. If there are contacts between bodies, (n, 8): the
+    nodes of the other body's tetrahedron follow."""
     weights: Any
-    """(n, 4) or (B, K, 4) float64, barycentric weights, sum 1."""
+    """(n, 4) or (B, K, 4) float64, barycentric weights, sum 1. The weights of another body's tetrahedron are negative,
+    sum -1; for a contact with the ground they are 0."""
     axes: Any
     """(n, 3, 3) or (B, K, 3, 3), contact frames: the rows are the unit normal and two unit tangents."""
     gaps: Any
     """(n,) or (B, K) m, signed distance at the start of the step."""
     faces: Any
-    """(n,) or (B, K) int32, index of the contact plane of each point; 0 is the ground, flat or not."""
+    """(n,) or (B, K) int32, index of the contact plane of each point; 0 is the ground, flat or not. For a contact with
+    another body, -1 minus its index."""
     node_count: int
     """Number N of nodes of a world."""
     counts: Any = None
@@ -76,9 +80,14 @@ class ContactSet(BatchedRecord):
         """
         entries = self.weights[:, None, :, None] * self.axes[:, :, None]
         columns = 3 * self.nodes[:, None, :, None] + np.arange(3, dtype=np.int32)
-        offsets = np.arange(0, entries.size + 1, 12, dtype=np.int32)
+        offsets = np.arange(0, entries.size + 1, 3 * self.nodes.shape[1], dtype=np.int32)
         indices = np.broadcast_to(columns, entries.shape).reshape(-1)
         return sparse.csr_matrix((entries.reshape(-1), indices, offsets), (3 * self.count, 3 * self.node_count))
+
+    @cached_property
+    def jacobian_columns(self) -> sparse.csr_matrix:
+        """Sparse (3N, 3n) transposed contact Jacobian W^T of one world."""
+        return self.jacobian.T.tocsr()
 
     def jacobian_transposed(self, out: Any = None) -> Any:
         """Return the transposed contact Jacobian W^T, (3N, 3n) or (B, 3N, 3K); ``out`` is zeroed memory for it."""
@@ -132,12 +141,15 @@ class ContactSet(BatchedRecord):
     def arrays(self) -> list[wp.array]:
         """Warp arrays (B,) and (B, K) of counts, nodes, weights and axes, the arguments of the kernels."""
         counts = np.array([self.capacity], np.int32) if self.counts is None else self.counts
-        pairs = (self.nodes, wp.vec4i), (self.weights, Vec4), (self.axes, Mat33)
+        shape = *self.points.shape[:-1], self.capacity * (self.nodes.shape[-1] // 4), 4
+        by_side = [each.reshape(shape) for each in (self.nodes, self.weights)]
+        pairs = (by_side[0], wp.vec4i), (by_side[1], Vec4), (self.axes, Mat33)
         return [as_warp(counts, wp.int32), *(self._array(*pair) for pair in pairs)]
 
     @cached_property
     def addresses(self) -> list[int]:
-        """Number of contacts of one world, and the host addresses of their nodes, weights and axes."""
+        """Number of contacts of one world with the ground, and the host addresses of their nodes, weights and axes."""
+        assert self.nodes.shape[1] == 4
         return [self.count, *(array.ptr or 0 for array in self.arrays[1:])]
 
     def _array(self, values: Any, kind: Any) -> wp.array:
@@ -170,6 +182,14 @@ class ContactSet(BatchedRecord):
         """Return these contacts of one world followed by ``others`` of the same body."""
         arrays = {name: np.concatenate([value, getattr(others, name)]) for name, value in self.batched_fields()}
         return replace(self, **arrays)
+
+    def with_nodes_of(self, nodes: slice) -> ContactSet:
+        """Return the contacts of one world with the nodes numbered from the start of ``nodes``; other nodes get
+        negative numbers. The result serves to compare nodes only."""
+        if nodes == slice(None):
+            return self
+        is_inside = (self.nodes >= nodes.start) & (self.nodes < nodes.stop)
+        return replace(self, nodes=np.where(is_inside, self.nodes - nodes.start, -1))
 
     def with_capacity(self, capacity: int) -> ContactSet:
         """Return the contacts padded to ``capacity``, which is at least the current one."""

@@ -19,6 +19,7 @@ from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
 from egs_warp.contact.newton_round import run_round
 from egs_warp.contact.selection import ACTIVATION_DEPTH, ContactSelector
 from egs_warp.fem.implicit_step import ImplicitStep
+from egs_warp.fem.island_problem import IslandProblem
 from egs_warp.kernels.contact.newton_convergence import ACCEPTED, ENDED
 from egs_warp.muscles.tension import MuscleEnergy
 
@@ -90,15 +91,20 @@ class NewtonOptions:
         speeds = push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT_FRACTION, tolerance)
         return speeds if contacts.counts is None else speeds * contacts.valid
 
-    def progress(self, problem: ImplicitStep, *, last: bool = False) -> NewtonProgress:
+    def progress(self, problem: ImplicitStep | IslandProblem, *, last: bool = False) -> NewtonProgress:
         """Return the progress at the start of a round. In the ``last`` round no points are added."""
-        coulomb_tolerance = COULOMB_TOLERANCE * problem.residual_scale / problem.body.mass
+        coulomb_tolerance = COULOMB_TOLERANCE * problem.free_fall_speed
         return NewtonProgress(self.tolerance, -1.0 if last else ACTIVATION_RESIDUAL, coulomb_tolerance)
 
 
 @dataclass(frozen=True)
 class CoupledSolver(NewtonOptions):
     """Newton's method on velocities and contact forces of one world."""
+
+    @property
+    def friction(self) -> float:
+        """Coulomb coefficient."""
+        return self.detector.geometry.friction
 
     def solve(
         self,
@@ -182,8 +188,7 @@ class _OneRound:
         """Take a full Newton step and judge its trial. A GPU takes further steps until one needs a decision of the
         host; all but the last are accepted.
         """
-        friction = self._solver.detector.geometry.friction
-        self._steps = self.iterate.newton_steps(self._normal_bias, friction, self.progress)
+        self._steps = self.iterate.newton_steps(self._normal_bias, self._solver.friction, self.progress)
         self._accept(self._steps.trial)
 
     def halve_step(self, worlds: tuple[int, ...]) -> None:

@@ -33,7 +33,7 @@ class ContactLinearization:
     """(3N, 3n) m/s per newton, dt J^-1 W^T, on the device of the factors."""
 
     @classmethod
-    def of(cls, tangent: Tangent, contacts: ContactSet, columns: np.ndarray | None = None) -> ContactLinearization:
+    def of(cls, tangent: Tangent, contacts: ContactSet, columns: np.ndarray | None = None) -> Self:
         """Linearise ``contacts`` with ``tangent``; ``columns`` are computed unless they are passed."""
         if columns is None:
             columns = tangent.solve(contacts.jacobian_transposed())
@@ -76,7 +76,7 @@ class ContactLinearization:
         """Return the linearisation of ``contacts``, which begin with the current ones, with the same tangent."""
         new = contacts.jacobian_transposed()[:, 3 * self.contacts.count :]
         columns = np.hstack([self.columns, self.tangent.problem.dt * self.tangent.solve(new)])
-        return ContactLinearization.of(self.tangent, contacts, columns)
+        return type(self).of(self.tangent, contacts, columns)
 
     def iterate_at(self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray) -> NewtonIterate:
         """Return the Newton iterate at ``velocities`` (N, 3) and contact ``forces`` (n, 3), under ``tension``."""
@@ -241,9 +241,24 @@ class NewtonStepResult:
     """Iterate at the end of the last step."""
 
 
+class HostNewtonStep:
+    """The Newton step of iterates with NumPy arrays."""
+
+    def newton_steps(
+        self: NewtonIterate, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
+    ) -> NewtonStepResult:
+        """Take one Newton step with the contact forces that satisfy Coulomb's law."""
+        forces, violation = self.linearization.solve_coulomb(self.free_contact_velocities, shift, friction, self.forces)
+        trial = self.line_search_point(forces)
+        if progress is not None:
+            progress.begin(self.residual_norm)
+            progress.judge(trial.residual_norm, violation)
+        return NewtonStepResult(self, forces, violation, trial)
+
+
 @dataclass(frozen=True, eq=False)
-class NativeNewtonIterate:
-    """``NewtonIterate`` evaluated by CPU kernels."""
+class NativeNewtonIterate(HostNewtonStep):
+    """``NewtonIterate`` of one body, evaluated by CPU kernels."""
 
     linearization: ContactLinearization
     tension: MuscleEnergy | None
@@ -291,17 +306,6 @@ class NativeNewtonIterate:
         step = response.columns_address, forces, length
         state_and_norm = _workspace_of(response).trial(response.tangent.problem, self.tension, self._after, step)
         return type(self)(response, self.tension, *state_and_norm)
-
-    def newton_steps(
-        self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
-    ) -> NewtonStepResult:
-        """Take one Newton step with the contact forces that satisfy Coulomb's law."""
-        forces, violation = self.linearization.solve_coulomb(self.free_contact_velocities, shift, friction, self.forces)
-        trial = self.line_search_point(forces)
-        if progress is not None:
-            progress.begin(self.residual_norm)
-            progress.judge(trial.residual_norm, violation)
-        return NewtonStepResult(self, forces, violation, trial)
 
     def with_new_tangent(self) -> Self:
         """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""

@@ -1,22 +1,22 @@
 """Contacts between bodies: the contact points of each body against the level sets of the other bodies.
 
 ``PairContactDetector`` finds the pairs of bodies that may touch in a step, selects contact points with the
-``ContactSelector`` of each body, and builds a two-sided ``PairContactSet``. The mathematics is in
-``kernels/contact/pair_contact.py``. The step does not use it yet (docs/concepts/bodies.md).
+``ContactSelector`` of each body, and builds a ``ContactSet`` of contacts with two sides. The mathematics is in
+``kernels/contact/pair_contact.py``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-import scipy.sparse as sparse
 import warp as wp
 
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.detection import ContactGeometry
-from egs_warp.contact.selection import ContactSelector
+from egs_warp.contact.selection import ACTIVATION_DEPTH, ContactSelector
 from egs_warp.kernels.contact import pair_contact as kernels
 from egs_warp.launching import copy_into, empty, launch_cached, zeros
 from egs_warp.meshing.level_set import LevelSet
@@ -45,96 +45,116 @@ class PairBody:
     selector: ContactSelector
     """Cells of the contact points, activation distance and hysteresis."""
     level_set: LevelSet
-    """Level set of the shape at rest, in the frame of the cage."""
-
-
-@dataclass(frozen=True, eq=False)
-class PairContactSet:
-    """n contacts between bodies, sorted by key. Contact velocities are the velocities of body a relative to body b."""
-
-    keys: np.ndarray
-    """(n, 3) int: body a, body b, contact point of body a."""
-    nodes: np.ndarray
-    """(n, 2, 4) int, nodes of body a and of body b, in the numbering of all bodies."""
-    weights: np.ndarray
-    """(n, 2, 4) float64, barycentric weights of the contact point in the tetrahedra of body a and of body b, sum 1."""
-    axes: np.ndarray
-    """(n, 3, 3), contact frames: the rows are the unit normal, from b to a, and two unit tangents."""
-    gaps: np.ndarray
-    """(n,) m, signed distance at the start of the step."""
-    node_count: int
-    """Number N of nodes of all bodies."""
-
-    @property
-    def count(self) -> int:
-        """Number n of contacts."""
-        return len(self.keys)
-
-    @cached_property
-    def jacobian(self) -> sparse.csr_matrix:
-        """Sparse (3n, 3N) contact Jacobian W. The rows of a contact are its axes times the weights, with positive sign
-        at the nodes of body a and negative sign at the nodes of body b.
-        """
-        signed = self.weights * np.array([[1.0], [-1.0]])
-        entries = self.axes[:, :, None, None, :] * signed[:, None, :, :, None]
-        columns = np.broadcast_to(3 * self.nodes[:, None, :, :, None] + np.arange(3), entries.shape)
-        rows = np.repeat(np.arange(3 * self.count), 24)
-        shape = 3 * self.count, 3 * self.node_count
-        return sparse.csr_matrix((entries.ravel(), (rows, columns.ravel())), shape)
+    """Level set of the shape at rest."""
+    rest_positions: np.ndarray
+    """(N, 3) m, nodes of the cage at rest in the frame of the level set."""
 
 
 class PairContactDetector:
     """Detector of the contacts between the bodies of one world.
 
-    The nodes of the bodies are concatenated; the nodes of body i begin at ``node_starts[i]``.
+    The nodes and the contact points of the bodies are concatenated. The contact of a point with body b has the number
+    (b + 1) P plus the number of the point, where P is the number of all points; smaller numbers are contacts with the
+    ground. So one number identifies every contact of the world.
     """
 
     def __init__(self, bodies: Sequence[PairBody], *, device: str | None = None) -> None:
-        self.bodies, self.device = tuple(bodies), wp.get_device(device)
-        sizes = [len(body.geometry.mesh.nodes) for body in bodies]
-        self.node_starts = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+        self.device = wp.get_device(device)
+        self._set_bodies(bodies, [_DeformedBody(body, self.device) for body in bodies])
+
+    def _set_bodies(self, bodies: Sequence[PairBody], states: Sequence[_DeformedBody]) -> None:
+        self.bodies, self._states = tuple(bodies), tuple(states)
+        nodes, points = (
+            [len(body.geometry.mesh.nodes) for body in bodies],
+            [len(body.geometry.tet_from_point) for body in bodies],
+        )
+        self.point_counts = points
+        """Number of contact points of each body."""
+        self.node_starts = np.concatenate([[0], np.cumsum(nodes)]).astype(int)
         """(nbody + 1,) first node of each body, and the number of all nodes."""
-        self._margins = [BODY_INFLATION * body.selector.activation_distance + _protrusion(body) for body in bodies]
-        self._states = [_DeformedBody(body, self.device) for body in bodies]
+        self.point_starts = np.concatenate([[0], np.cumsum(points)]).astype(int)
+        """(nbody + 1,) first contact point of each body, and the number P of all points."""
+
+    def numbers(self, body: int | np.ndarray, points: np.ndarray, other: int | np.ndarray) -> np.ndarray:
+        """Return the numbers (n,) of the contacts of ``points`` (n,) of ``body`` with the body ``other``, or with the
+        ground if it is -1; bodies can be arrays (n,)."""
+        return (other + 1) * self.point_starts[-1] + self.point_starts[body] + points
+
+    def keys(self, numbers: np.ndarray) -> np.ndarray:
+        """Return (n, 3) for the ``numbers`` (n,) of contacts: body a, body b (-1 for the ground), and the point of body
+        a."""
+        others, points = np.divmod(numbers, self.point_starts[-1])
+        bodies = np.searchsorted(self.point_starts, points, side="right") - 1
+        return np.column_stack([bodies, others - 1, points - self.point_starts[bodies]])
 
     def body_pairs(self, positions: np.ndarray) -> list[tuple[int, int]]:
         """Return the ordered pairs (a, b) of bodies whose inflated boxes overlap at ``positions`` (N, 3), both (a, b)
         and (b, a), in ascending order.
         """
-        boxes = [
-            (part.min(axis=0) - margin, part.max(axis=0) + margin)
-            for part, margin in zip(self._split(positions), self._margins, strict=True)
-        ]
+        boxes = []
+        for body, part in zip(self.bodies, self._split(positions), strict=True):
+            # The cage encloses the body, but the tetrahedron of a prop does not.
+            corners = (
+                part if len(body.geometry.mesh.tets) > 1 else body.geometry.weights @ part[body.geometry.mesh.tets[0]]
+            )
+            margin = BODY_INFLATION * body.selector.activation_distance
+            boxes.append((corners.min(axis=0) - margin, corners.max(axis=0) + margin))
         lows, highs = (np.array(each).reshape(-1, 3) for each in zip(*boxes, strict=True))
         overlaps = np.all((lows[:, None] <= highs) & (lows <= highs[:, None]), axis=2)
         np.fill_diagonal(overlaps, False)
         return [(int(a), int(b)) for a, b in np.argwhere(overlaps)]
 
-    def select(
-        self, end_positions: np.ndarray, previous: PairContactSet | None = None, loaded: np.ndarray | None = None
-    ) -> np.ndarray:
+    def select(self, end_positions: np.ndarray, previous: np.ndarray, loaded: np.ndarray) -> np.ndarray:
         """Select the contacts of a step: in each cell of body a at most one point against each body b, by the rules of
         ``ContactSelector``.
 
         Args:
             end_positions: (N, 3) m, at the predicted end of the step.
-            previous: contacts of the previous step.
-            loaded: (m,) bool, True for contacts of ``previous`` that carried load.
+            previous: (m,) numbers of the contacts of the previous step.
+            loaded: (m,) bool, True for those that carried load.
 
         Returns:
-            (n, 3) int, keys in ascending order.
+            (n,) numbers, sorted by body a, body b and point.
         """
+        keys, selected = self.keys(previous), [np.zeros(0, int)]
         pairs = self.body_pairs(end_positions)
         self._place(end_positions, {body for pair in pairs for body in pair})
-        keys = []
         for a, b in pairs:
-            points, was_loaded = np.zeros(0, int), np.zeros(0, bool)
-            if previous is not None and loaded is not None:
-                same = (previous.keys[:, :2] == (a, b)).all(axis=1)
-                points, was_loaded = previous.keys[same, 2], loaded[same]
-            selected = self.bodies[a].selector.select(points, was_loaded, self._gaps(a, b))
-            keys.append(np.column_stack([np.tile([a, b], (len(selected), 1)), selected]))
-        return np.concatenate([np.zeros((0, 3), int), *keys])
+            same = (keys[:, 0] == a) & (keys[:, 1] == b)
+            points = self.bodies[a].selector.select(keys[same, 2], loaded[same], self._gaps(a, b))
+            selected.append(self.numbers(a, points, b))
+        return np.concatenate(selected)
+
+    def find_penetrating(
+        self, contacts: np.ndarray, start: np.ndarray, end: np.ndarray, tolerance: float
+    ) -> np.ndarray:
+        """Find the points that would be too deep in another body at the end of a step and are not contacts; see
+        ``ContactSelector``.
+
+        Args:
+            contacts: (n,) numbers of the contacts of the step.
+            start: (N, 3) m, at the start of the step.
+            end: (N, 3) m, at the end of the step.
+            tolerance: penetration tolerance, m.
+
+        Returns:
+            (k,) numbers.
+        """
+        keys, found = self.keys(contacts), [np.zeros(0, int)]
+        for a, b in self.body_pairs(end):
+            # The gaps at the end come last, because the record extrapolates in the tetrahedra that they find.
+            start_gaps, end_gaps = self.gaps(a, b, start), self.gaps(a, b, end)
+            if end_gaps.min() < -ACTIVATION_DEPTH * tolerance:
+                own = keys[(keys[:, 0] == a) & (keys[:, 1] == b), 2]
+                points = self.bodies[a].selector.find_penetrating(own, end_gaps, start_gaps, tolerance)
+                found.append(self.numbers(a, points, b))
+        return np.concatenate(found)
+
+    def subset(self, members: Sequence[int]) -> PairContactDetector:
+        """Return the detector of some of the bodies, which shares the buffers of this one."""
+        other = copy(self)
+        other._set_bodies([self.bodies[i] for i in members], [self._states[i] for i in members])
+        return other
 
     def gaps(self, a: int, b: int, positions: np.ndarray) -> np.ndarray:
         """Return (P,) m, the gaps of the contact points of body ``a`` to body ``b`` at ``positions`` (N, 3) of all
@@ -143,20 +163,22 @@ class PairContactDetector:
         self._place(positions, {a, b})
         return self._gaps(a, b)
 
-    def contact_set(self, keys: np.ndarray, positions: np.ndarray) -> PairContactSet:
-        """Return the contacts with the ``keys`` (n, 3) from ``select``, for nodal ``positions`` (N, 3) m at the start
+    def contact_set(self, numbers: np.ndarray, positions: np.ndarray) -> ContactSet:
+        """Return the contacts with the ``numbers`` (n,) from ``select``, for nodal ``positions`` (N, 3) m at the start
         of the step.
         """
-        keys = np.asarray(keys, int).reshape(-1, 3)
+        keys = self.keys(numbers)
         self._place(positions, set(keys[:, :2].ravel().tolist()))
-        starts, changes = np.unique(keys[:, :2], axis=0, return_index=True)
-        records = []
-        bounds = np.append(changes, len(keys)).tolist()
-        for (a, b), start, end in zip(starts.tolist(), bounds[:-1], bounds[1:], strict=True):
-            records.append(self._record(a, b, keys[start:end, 2]))
-        empty = np.zeros((0, 2, 4), int), np.zeros((0, 2, 4)), np.zeros((0, 3, 3)), np.zeros(0)
-        fields = [np.concatenate(each) for each in zip(empty, *records, strict=True)]
-        return PairContactSet(keys, *fields, node_count=int(self.node_starts[-1]))
+        pairs = np.unique(keys[:, :2], axis=0)
+        order, records = [], [(np.zeros((0, 8), np.int32), np.zeros((0, 8)), np.zeros((0, 3, 3)), np.zeros(0))]
+        for a, b in pairs.tolist():
+            chosen = np.flatnonzero((keys[:, 0] == a) & (keys[:, 1] == b))
+            order.append(chosen)
+            records.append(self._record(a, b, keys[chosen, 2]))
+        back = np.argsort(np.concatenate([np.zeros(0, int), *order]))
+        nodes, weights, axes, gaps = (np.concatenate(each)[back] for each in zip(*records, strict=True))
+        faces = (-1 - keys[:, 1]).astype(np.int32)
+        return ContactSet(numbers, nodes, weights, axes, gaps, faces, int(self.node_starts[-1]))
 
     def _split(self, positions: np.ndarray) -> list[np.ndarray]:
         return np.split(positions, self.node_starts[1:-1])
@@ -172,7 +194,7 @@ class PairContactDetector:
             kernels.pair_gaps_kernel,
             first.gaps.shape,
             inputs=[*first.points, *second.shape, first.positions, second.positions],
-            outputs=[first.gaps, first.tets_of(b)],
+            outputs=[first.gaps, first.tets_of(second)],
             device=self.device,
         )
         return first.gaps.numpy()[0].copy()
@@ -185,13 +207,21 @@ class PairContactDetector:
         launch_cached(
             kernels.pair_record_kernel,
             shape,
-            inputs=[*first.points, *second.shape, chosen, count, first.tets_of(b), first.positions, second.positions],
+            inputs=[
+                *first.points,
+                *second.shape,
+                chosen,
+                count,
+                first.tets_of(second),
+                first.positions,
+                second.positions,
+            ],
             outputs=outputs,
             device=self.device,
         )
         nodes, weights, other_nodes, other_weights, axes, gaps = (each.numpy()[0] for each in outputs)
-        both = np.stack([nodes + self.node_starts[a], other_nodes + self.node_starts[b]], axis=1)
-        return both, np.stack([weights, other_weights], axis=1), axes, gaps
+        both = np.hstack([nodes + self.node_starts[a], other_nodes + self.node_starts[b]]).astype(np.int32)
+        return both, np.hstack([weights, -other_weights]), axes, gaps
 
 
 class _DeformedBody:
@@ -209,11 +239,11 @@ class _DeformedBody:
         self._lowers, self._uppers = (empty(len(mesh.tets), wp.vec3, device) for _ in range(2))
         self._compute_boxes()
         self._hierarchy = wp.Bvh(self._lowers, self._uppers, groups=zeros(len(mesh.tets), int, device))
-        rest = wp.array(mesh.nodes[None], dtype=Vec3, device=device)
+        rest = wp.array(body.rest_positions[None], dtype=Vec3, device=device)
         level_set = body.level_set
         self.shape = [self._tets, rest, self._hierarchy.id, level_set.lattice, level_set.on_device(device)]
         self.gaps = zeros((1, len(geometry.weights)), real, device)
-        self._tets_of: dict[int, wp.array] = {}
+        self._tets_of: dict[_DeformedBody, wp.array] = {}
 
     def place(self, positions: np.ndarray) -> None:
         """Move the nodes to ``positions`` (N, 3)."""
@@ -221,8 +251,8 @@ class _DeformedBody:
         self._compute_boxes()
         self._hierarchy.refit()
 
-    def tets_of(self, other: int) -> wp.array:
-        """Return the buffer (1, P) for the tetrahedron of body ``other`` at each point, initially -1."""
+    def tets_of(self, other: _DeformedBody) -> wp.array:
+        """Return the buffer (1, P) for the tetrahedron of ``other`` at each point, initially -1."""
         if other not in self._tets_of:
             self._tets_of[other] = wp.full(self.gaps.shape, -1, dtype=int, device=self.device)
         return self._tets_of[other]

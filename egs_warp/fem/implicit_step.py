@@ -84,6 +84,11 @@ class ImplicitStep(StepValues, BatchedRecord):
         """dt times the weight, N s, the unit of residual norms."""
         return self.dt * self.body.weight
 
+    @property
+    def free_fall_speed(self) -> float:
+        """Speed that free fall gains in the step, m/s."""
+        return self.residual_scale / self.body.mass
+
     def end_positions(self, velocities: Any) -> Any:
         """Return x + dt v (..., N, 3), m."""
         return self.state.positions + self.dt * velocities

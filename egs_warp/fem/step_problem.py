@@ -82,6 +82,10 @@ class StepProblem(ImplicitStep):
         rotated = Rotation.from_rotvec(self.dt * spin).apply(positions - centre)
         return mass @ self.state.velocities / mass.sum() + (rotated - (positions - centre)) / self.dt
 
+    def relative_norm(self, residual: np.ndarray) -> float:
+        """Return the norm of a residual (N, 3) N s, divided by dt times the weight."""
+        return float(np.linalg.norm(residual)) / self.residual_scale
+
     def internal_gradient(self, velocities: np.ndarray, tension: MuscleEnergy | None) -> np.ndarray:
         """Return minus the forces of elasticity, damping and muscles at the end of the step: (N, 3) N."""
         end = self.end_positions(velocities)

@@ -26,14 +26,14 @@ class Audit:
     """Force outside the friction cone, divided by m g."""
     friction_gap: float
     """Difference between the actual work of friction and the work of a friction force at its bound that opposes the
-    slip, divided by m g H."""
+    slip, divided by m g H. Contacts with other bodies are not included, because their slip is relative to that body."""
     contact_velocity: float
     """Difference between the stored end velocities of loaded contacts and their displacements per time step, divided by
     sqrt(g H)."""
     penetration: float
     """Depth of the deepest contact point, divided by H."""
     complementarity_gap: float
-    """Normal force times gap at the end of the step, divided by m g H."""
+    """Normal force times gap at the end of the step, divided by m g H, for contacts with the ground and solids."""
     inverted_elements: int
     """Number of inverted elements, summed over all states."""
     newton_unconverged: int
@@ -60,6 +60,7 @@ def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton
     slip = displacements - along[:, None] * normals
     # Coulomb: mu f_n |slip| + f_t . slip is never negative, and zero if friction is at its bound and opposes the slip,
     # or if the contact does not slip.
+    fixed = t.contact_plane >= 0
     friction_gap = np.abs(t.friction * normal * np.linalg.norm(slip, axis=1) + np.einsum("ci,ci->c", tangential, slip))
     velocity_errors = np.linalg.norm(by_velocities - displacements, axis=1) / t.dt[t.contact_step]
     deepest = min(float(t.min_gap.min()), float(_uneven_end_gaps(t).min(initial=0.0)))
@@ -72,12 +73,12 @@ def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton
         cone_violation=float(
             np.maximum(friction_forces - t.friction * normal, -normal).max(initial=0.0) * t.height / unit
         ),
-        friction_gap=float(friction_gap.max(initial=0.0) / unit),
+        friction_gap=float(friction_gap[fixed].max(initial=0.0) / unit),
         contact_velocity=float(
             velocity_errors[normal > 0.0].max(initial=0.0) / np.sqrt(np.linalg.norm(t.gravity) * t.height)
         ),
         penetration=float(max(-deepest, 0.0) / t.height),
-        complementarity_gap=float((normal * np.maximum(_start_gaps(t) + along, 0.0)).max(initial=0.0) / unit),
+        complementarity_gap=float((normal * np.maximum(_start_gaps(t) + along, 0.0))[fixed].max(initial=0.0) / unit),
         inverted_elements=int((np.linalg.det(edges) <= 0.0).sum()),
         newton_unconverged=newton_unconverged,
     )

@@ -21,9 +21,10 @@ from egs_warp.fem.batch_problem import BatchBody, BatchProblem, apply_inverse
 from egs_warp.fem.batched import BatchedRecord, nonzero, padded
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.panel_cholesky import CHUNK_BYTES, PANEL
+from egs_warp.locomotion.linear_step import PREDICTION_ITERATIONS
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.settling import SETTLING_STEP, SETTLING_STEPS, has_settled
-from egs_warp.locomotion.stepper import MAX_HALVINGS, PREDICTION_ITERATIONS, StepReport, WarmStart
+from egs_warp.locomotion.stepper import MAX_HALVINGS, StepReport, WarmStart
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.render.autograd import torch_stream
 

@@ -34,6 +34,27 @@ class PredictedStep:
     """(N, 3) m/s, at the end of the step."""
     forces: np.ndarray
     """(n, 3) N, contact forces in the axes of each contact."""
+    body: int | None = None
+    """Index of the planned body in its island; None if the linearisation contains only this body."""
+    other_tensions: Any = None
+    """Muscles of the other bodies of the island (``fem.island_problem.Tensions``), or None."""
+
+    @property
+    def problem(self) -> StepProblem:
+        """Step of the planned body."""
+        joint: Any = self.linearization.tangent.problem
+        return joint if self.body is None else joint.problems[self.body]
+
+    @property
+    def nodes(self) -> slice:
+        """Nodes of the planned body."""
+        joint: Any = self.linearization.tangent.problem
+        return slice(None) if self.body is None else joint.nodes_of(self.body)
+
+    @property
+    def coordinates(self) -> slice:
+        """Rows of the planned body among the coordinates of all nodes."""
+        return slice(None) if self.body is None else slice(3 * self.nodes.start, 3 * self.nodes.stop)
 
 
 @dataclass(frozen=True)
@@ -94,6 +115,12 @@ class LinearStep:
         """Return W ``velocities``, (3n, k + 1) m/s, in the axes of ``contacts`` (Eq. 8)."""
         return contacts.contact_velocities(self.velocities)
 
+    def of_coordinates(self, coordinates: slice) -> LinearStep:
+        """Return the end velocity of some of the coordinates; of all of them, this object."""
+        if coordinates == slice(None):
+            return self
+        return LinearStep(self.velocities[coordinates], self.torques)
+
     def objective_quadratic(self, objectives: Sequence[Objective]) -> Callable[[], np.ndarray]:
         """Start computing the quadratic form of the weighted squares of ``objectives``; it may run asynchronously on a
         device.
@@ -137,22 +164,31 @@ class HostStepLinearizer:
     def linearize(self, predicted: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
         """Linearise the step about ``predicted``: v = v^ - J^-1 r0(v^) + dt J^-1 (A a + W^T f), Eq. (7); run ``other``
         concurrently."""
-        response, predicted_velocities, m = predicted.linearization, predicted.velocities, self._count
-        problem, contacts = response.tangent.problem, response.contacts
+        response, m = predicted.linearization, self._count
+        problem, contacts = predicted.problem, response.contacts
         weight = problem.body.weight
-        # Residual without muscles and contact.
-        free = problem.residual(predicted_velocities, None).ravel()
-        impulses = self._impulses.with_base(free, problem.end_positions(predicted_velocities), problem.dt)
+        # Residual without the body's muscles and contact.
+        free = response.tangent.problem.residual(predicted.velocities, predicted.other_tensions).ravel()
+        own, ends = predicted.coordinates, problem.end_positions(predicted.velocities[predicted.nodes])
+        impulses = self._impulses.with_base(free[own], ends, problem.dt)
+        if predicted.body is not None:
+            of_body, impulses = impulses, np.zeros((free.size, m + 1))
+            impulses[own], impulses[:, -1] = of_body, free
         solved, other_result = run_concurrently(lambda: response.tangent.solve(impulses), other)
         velocities = np.empty((free.size, m + 3 * contacts.count + 1))
         velocities[:, :m] = solved[:, :-1]
         np.multiply(weight, response.columns, out=velocities[:, m:-1])
-        np.subtract(predicted_velocities.ravel(), solved[:, -1], out=velocities[:, -1])
-        return LinearStep(velocities, torques_of(problem, contacts, m)), other_result
+        np.subtract(predicted.velocities.ravel(), solved[:, -1], out=velocities[:, -1])
+        return LinearStep(velocities, torques_of(problem, contacts, m, own)), other_result
 
 
-def torques_of(problem: StepProblem, contacts: ContactSet, m: int) -> np.ndarray:
+def torques_of(problem: StepProblem, contacts: ContactSet, m: int, own: slice = slice(None)) -> np.ndarray:
     """Return (3, m + 3n) kg m^2/s, derivative of the angular momentum with respect to x: zero for the ``m``
-    activations, and the angular impulse of one body weight along each axis of each contact."""
-    torques = problem.dt * problem.body.weight * contacts.contact_velocities(problem.rotation_modes).T
+    activations, and the angular impulse of one body weight along each axis of each contact. ``own`` are the rows of the
+    body among the coordinates of the contacts' nodes."""
+    modes = problem.rotation_modes
+    if own != slice(None):
+        modes = np.zeros((3 * contacts.node_count, 3))
+        modes[own] = problem.rotation_modes
+    torques = problem.dt * problem.body.weight * contacts.contact_velocities(modes).T
     return np.hstack([np.zeros((3, m)), torques])

@@ -132,8 +132,8 @@ class StepPlanner:
     def program(self, predicted: PredictedStep, last: np.ndarray, objectives: Sequence[AnyObjective]) -> StepProgram:
         """Build the QP of the step about ``predicted``: objectives, elastic effort and activation costs, contact
         velocities, and bounds of the activations. ``last`` (M,) m are the activations of the previous step."""
-        response, predicted_velocities, body = predicted.linearization, predicted.velocities, self.body
-        problem, contacts = response.tangent.problem, response.contacts
+        body, predicted_velocities = self.body, predicted.velocities[predicted.nodes]
+        problem, contacts = predicted.problem, predicted.linearization.contacts
         weight, speed = body.weight, body.speed_unit
         # ``linearize`` may run concurrently with ``EffortModel.of``. Only the latter uses the elasticity kernels, which
         # are not thread-safe.
@@ -141,16 +141,17 @@ class StepPlanner:
             predicted, lambda: EffortModel.of(problem, predicted_velocities, self.factors)
         )
         previous = self.synergies.mean(last / self.muscles.bounds)
-        finish_objectives = objectives_cost(problem, linear, contacts, objectives, speed)
+        own = linear.of_coordinates(predicted.coordinates)
+        finish_objectives = objectives_cost(problem, own, contacts.with_nodes_of(predicted.nodes), objectives, speed)
         activation = self._activation_cost(problem, predicted_velocities, previous, linear.count)
-        effort = effort_cost(problem, linear, predicted_velocities.ravel(), effort_model)
+        effort = effort_cost(problem, own, predicted_velocities.ravel(), effort_model)
         cost = finish_objectives() + effort + activation
         contact_velocities = linear.contact_velocities(contacts)
         rows, offset = contact_velocities[:, :-1] / speed, contact_velocities[:, -1] / speed
         offset[::3] += predicted.normal_bias / speed
         bounds = self.activation_bounds(previous, problem.dt)
         coulomb_program = CoulombProgram(cost.P, cost.q, cost.constant, rows, offset, self.friction, *bounds)
-        slip = contacts.contact_velocities(predicted_velocities.ravel()).reshape(-1, 3) / speed
+        slip = contacts.contact_velocities(predicted.velocities.ravel()).reshape(-1, 3) / speed
         start = self.synergies.mean(predicted.activations / self.muscles.bounds)
         return StepProgram(
             coulomb_program, PredictedContact(start, predicted.forces / weight, slip), linear, contact_velocities

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -27,6 +27,13 @@ FRAME_RATE = 60
 """Frame rate of a video, 1/s."""
 REST_FRAMES = 20
 """Number of frames for which a run continues after the motion has finished."""
+_MIN_SUPPORT_COSINE = 0.7
+"""Cosine of the angle between the normal of a contact and the vertical, above which another body supports the body."""
+
+
+Kicks: TypeAlias = Callable[[float, float], np.ndarray | None]
+"""Function of time and step size, s, that returns the velocities (N, 3) m/s that external pushes add to the nodes at
+the start of the step, or None."""
 
 
 class Motion(Protocol):
@@ -65,6 +72,88 @@ def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]
     return frame / count, count
 
 
+class BodyRun:
+    """Progress of one body in a run: its state, warm start, reports and recording."""
+
+    def __init__(
+        self,
+        stepper: LocomotionStepper,
+        geometry: ContactGeometry,
+        start: BodyState,
+        motion: Motion,
+        *,
+        place: BodyFrame | None = None,
+        front: np.ndarray | None = None,
+        parts: Callable[[], Path] | None = None,
+        resume: Path | None = None,
+        kicks: Kicks = lambda time, dt: None,
+    ) -> None:
+        """Begin at ``start``; the arguments are described at ``roll_out``."""
+        self.stepper, self._motion, self._kicks = stepper, motion, kicks
+        self._up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
+        self.state, self.memory = start, stepper.initial_memory()
+        self.reports: list[StepReport] = []
+        self._shown = [0]
+        gaps, _ = stepper.detector.gaps(start.positions)
+        self._recorder = Recorder(
+            stepper.body,
+            stepper.muscles,
+            geometry,
+            start,
+            float(gaps.min()),
+            drag=stepper.settings.drag,
+            frame=place,
+            front=front,
+            folder=parts,
+        )
+        self._replay = Replay(resume, self._recorder.start, stepper.detector) if resume is not None else None
+        # Digests take time and are only read when a run is continued.
+        self._needs_digest = parts is not None or resume is not None
+        self._kick: np.ndarray | None = None
+        self._digest = 0
+
+    def objectives(self, dt: float) -> Sequence[AnyObjective]:
+        """Return the objectives of the motion for the next step of ``dt`` s."""
+        with one_blas_thread():
+            report = _without_pushes(self.reports[-1], self._up) if self.reports else None
+            return self._motion.objectives(self.state, report, dt)
+
+    def begin_step(
+        self, objectives: Sequence[AnyObjective], dt: float, activations: np.ndarray | None = None
+    ) -> tuple[BodyState, list[StepReport]]:
+        """Apply the external pushes of the next step.
+
+        Args:
+            objectives: objectives of the step.
+            dt: step size, s.
+            activations: (M,) m, prescribed activations; None if they are planned.
+
+        Returns:
+            The state from which the step starts, and the reports of the step if it is replayed, else an empty list.
+        """
+        self._kick = self._kicks(self.state.time, dt)
+        prescribed = [each for each in (self._kick, activations) if each is not None]
+        self._digest = digest([*objectives, *prescribed]) if self._needs_digest else 0
+        done = self._replay.step(self._digest) if self._replay is not None else []
+        return self.state.with_velocity_kick(self._kick), done
+
+    def finish_step(self, done: Sequence[StepReport]) -> None:
+        """Continue from the end of the step, and record ``done``, the reports of the parts into which it was
+        divided."""
+        self.state, self.memory = done[-1].state, WarmStart.from_report(done[-1])
+        self.reports.extend(done)
+        self._recorder.add(done, request_digest=self._digest, kick=self._kick)
+
+    def show_frame(self) -> None:
+        """Show the current state in the next frame of a video, unless no step has been made since the last one."""
+        if self._shown[-1] < len(self.reports):
+            self._shown.append(len(self.reports))
+
+    def result(self, *, stopped: bool) -> RolloutResult:
+        """Return the result; ``stopped`` is True if the next step cannot be solved."""
+        return RolloutResult(self._recorder.trajectory(), tuple(self.reports), np.array(self._shown), stopped)
+
+
 def roll_out(
     stepper: LocomotionStepper,
     geometry: ContactGeometry,
@@ -79,7 +168,7 @@ def roll_out(
     resume: Path | None = None,
     finished: Callable[[], bool] = lambda: False,
     aborted: Callable[[], bool] = lambda: False,
-    kicks: Callable[[float, float], np.ndarray | None] = lambda time, dt: None,
+    kicks: Kicks = lambda time, dt: None,
     activations: np.ndarray | None = None,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> RolloutResult:
@@ -100,8 +189,7 @@ def roll_out(
         finished: function that returns True once the motion has finished.
         aborted: function that is called after the motion has returned the objectives of a step. If it returns True, the
             run ends before this step.
-        kicks: function of time and step size, s, that returns the velocities (N, 3) m/s that external pushes add to the
-            nodes at the start of the step, or None.
+        kicks: external pushes, see ``Kicks``.
         activations: (steps, M) m, prescribed activations, which replace the planned ones; the run ends with the last
             whole frame that they cover.
         progress: function that receives the index of each finished frame.
@@ -109,57 +197,46 @@ def roll_out(
     dt, per_frame = solver_steps(stepper.body, step)
     if activations is not None:
         frames = min(frames, len(activations) // per_frame)
-    state, memory = start, stepper.initial_memory()
-    reports: list[StepReport] = []
-    shown = [0]
+    run = BodyRun(stepper, geometry, start, motion, place=place, front=front, parts=parts, resume=resume, kicks=kicks)
     resting = 0
     stopped = False
-    gaps, _ = stepper.detector.gaps(start.positions)
-    recorder = Recorder(
-        stepper.body,
-        stepper.muscles,
-        geometry,
-        start,
-        float(gaps.min()),
-        drag=stepper.settings.drag,
-        frame=place,
-        front=front,
-        folder=parts,
-    )
-    replay = Replay(resume, recorder.start, stepper.detector) if resume is not None else None
-    # Digests take time and are only read when a run is continued.
-    needs_digest = parts is not None or resume is not None
     for frame in range(frames):
         for part in range(per_frame):
-            with one_blas_thread():
-                objectives = motion.objectives(state, reports[-1] if reports else None, dt)
+            objectives = run.objectives(dt)
             if aborted():
                 break
-            kick = kicks(state.time, dt)
             step_activations = None if activations is None else activations[frame * per_frame + part]
-            prescribed = [each for each in (kick, step_activations) if each is not None]
-            request_digest = digest([*objectives, *prescribed]) if needs_digest else 0
-            done = replay.step(request_digest) if replay is not None else []
-            pushed_state = state.with_velocity_kick(kick)
+            state, done = run.begin_step(objectives, dt, step_activations)
             if step_activations is None:
-                done = done or _try_advance(partial(stepper.advance, pushed_state, memory, objectives, dt))
+                advance = partial(stepper.advance, state, run.memory, objectives, dt)
             else:
-                done = done or _try_advance(
-                    partial(stepper.advance_with_activations, pushed_state, memory, step_activations, dt)
-                )
+                advance = partial(stepper.advance_with_activations, state, run.memory, step_activations, dt)
+            done = done or _try_advance(advance)
             stopped = not done
             if stopped:
                 break
-            state, memory = done[-1].state, WarmStart.from_report(done[-1])
-            reports.extend(done)
-            recorder.add(done, request_digest=request_digest, kick=kick)
-        if shown[-1] < len(reports):
-            shown.append(len(reports))
+            run.finish_step(done)
+        run.show_frame()
         progress(frame)
         resting = resting + 1 if finished() else 0
         if stopped or resting == REST_FRAMES or aborted():
             break
-    return RolloutResult(recorder.trajectory(), tuple(reports), np.array(shown), stopped)
+    return run.result(stopped=stopped)
+
+
+def _without_pushes(report: StepReport, up: np.ndarray) -> StepReport:
+    """Return ``report`` without the contacts with other bodies that do not support the body against gravity, which is
+    opposite to ``up`` (3,): a motion must not take the body that pushes it for its ground."""
+    contacts = report.contacts
+    kept = (contacts.faces >= 0) | (contacts.axes[:, 0] @ up > _MIN_SUPPORT_COSINE)
+    if kept.all():
+        return report
+    return replace(
+        report,
+        contacts=replace(contacts, **{name: value[kept] for name, value in contacts.batched_fields()}),
+        forces=report.forces[kept],
+        end_gaps=report.end_gaps[kept],
+    )
 
 
 def _try_advance(advance: Callable[[], tuple[BodyState, WarmStart, list[StepReport]]]) -> list[StepReport]:

@@ -81,7 +81,7 @@ def objectives_value(
     contacts: ContactSet,
     objectives: Sequence[AnyObjective],
     velocities: np.ndarray,
-    forces: np.ndarray,
+    contact_forces: np.ndarray,
     speed: float,
 ) -> float:
     """Return the sum of the weighted squares of ``objectives`` at the given end of the step, in units of ``speed``.
@@ -92,10 +92,10 @@ def objectives_value(
         contacts: contacts of the step.
         objectives: objectives of the motion.
         velocities: (N, 3) m/s, end of the step.
-        forces: (n, 3) N, contact forces.
+        contact_forces: (N, 3) N, contact forces at the nodes.
         speed: unit of speed sqrt(g H), m/s.
     """
-    angular_impulse = problem.dt * (problem.rotation_modes.T @ contacts.nodal_forces(forces).ravel())
+    angular_impulse = problem.dt * (problem.rotation_modes.T @ contact_forces.ravel())
     residuals = [
         objective.residual(problem, contacts, velocities.ravel(), angular_impulse, speed) for objective in objectives
     ]

@@ -26,7 +26,6 @@ from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.linear_step import (
-    PREDICTION_ITERATIONS,
     HostStepLinearizer,
     PredictedStep,
     StepInputs,
@@ -34,6 +33,7 @@ from egs_warp.locomotion.linear_step import (
 )
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import MIN_STEPS_PER_TIME_UNIT, Plan, StageClock, StepPlanner
+from egs_warp.locomotion.prediction import predict_end
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.step_cost import objectives_value
@@ -46,7 +46,7 @@ from egs_warp.short_repr import short_repr
 
 MAX_HALVINGS = 4
 """Maximum number of successive halvings of a step that does not converge."""
-_REPLAN_FACTOR, _REPLAN_MARGIN = 1.2, 0.01
+REPLAN_FACTOR, REPLAN_MARGIN = 1.2, 0.01
 """A step is replanned if its objectives cost more than this factor times the value that the plan expects, plus this
 margin."""
 
@@ -226,6 +226,8 @@ class LocomotionStepper:
         Returns:
             State at the end, warm start of the next step, and the report of each step that was made, in order.
         """
+        if self.muscles.segment_count == 0:
+            return self.advance_with_activations(state, memory, memory.activations, dt)
         with one_blas_thread(), self.factors.stream:
             end, after, report = self.step(state, memory, objectives, dt)
             if report.converged:
@@ -243,8 +245,9 @@ class LocomotionStepper:
         objective value at their end. ``state`` is the state at their start."""
         before, last = (reports[-2].state if len(reports) > 1 else state), reports[-1]
         problem = StepProblem(self.body, before, last.dt, self.settings.drag)
+        pushes = last.contacts.nodal_forces(last.forces)
         value = objectives_value(
-            problem, last.contacts, objectives, last.state.velocities, last.forces, self.body.speed_unit
+            problem, last.contacts, objectives, last.state.velocities, pushes, self.body.speed_unit
         )
         return not all(report.converged for report in reports), value
 
@@ -328,7 +331,7 @@ class LocomotionStepper:
         if (
             result.converged
             and self._objective_value(problem, objectives, result.contacts, result)
-            > _REPLAN_FACTOR * expected + _REPLAN_MARGIN
+            > REPLAN_FACTOR * expected + REPLAN_MARGIN
         ):
             plan, result = self._replan(problem, plan, result, memory, objectives, clock)
         end, after, report = self._finish(problem, plan, result, clock)
@@ -421,7 +424,8 @@ class LocomotionStepper:
         end: Plan | CoupledResult,
     ) -> float:
         """Return the objective value at ``end``, the expected end of a plan or the end of a solve."""
-        return objectives_value(problem, contacts, objectives, end.velocities, end.forces, self.body.speed_unit)
+        pushes = contacts.nodal_forces(end.forces)
+        return objectives_value(problem, contacts, objectives, end.velocities, pushes, self.body.speed_unit)
 
     def _detect(self, problem: StepProblem, memory: WarmStart) -> ContactSet:
         """Select the contacts of the step: points in use, and points that ballistic motion brings close to the ground.
@@ -434,31 +438,11 @@ class LocomotionStepper:
         return self.detector.contact_set(self.selector.select(memory.points, loaded, gaps), problem.state.positions)
 
     def predict(self, start: StepInputs) -> PredictedStep:
-        """Predict the end of the step under the activations of the previous step, which ``start`` contains (Eq. 12).
-
-        The prediction starts from a rigid motion of the whole body. One Newton step with the previous contact forces
-        gives the velocities at which the tangent is factored; the plan uses this tangent. Then
-        ``PREDICTION_ITERATIONS`` Newton steps solve for velocities and Coulomb forces. A Newton step that would invert
-        an element is discarded.
-        """
-        problem, contacts, previous_forces = start.problem, start.contacts, start.forces
-        velocities, tension = problem.rigid_guess, MuscleEnergy.of(self.muscles, start.activations)
-        # The tangent omits the stiffness of the muscles, which does not improve the prediction; only the solve uses it.
-        tangent = problem.tangent(self.factors, velocities, None)
-        newton_velocities = self.linearizer.predict_velocities(tangent, contacts, tension, velocities, previous_forces)
-        if newton_velocities is not None:
-            velocities = newton_velocities
-            tangent = problem.tangent(self.factors, velocities, None)
-        response = self.linearizer(tangent, contacts)
-        iterate = response.iterate_at(tension, velocities, previous_forces)
-        forces = previous_forces
-        for _ in range(PREDICTION_ITERATIONS):
-            newton_result = iterate.newton_steps(start.normal_bias, start.friction)
-            forces = newton_result.forces
-            if not newton_result.trial.is_inversion_free:
-                break
-            iterate = newton_result.trial
-        return PredictedStep(response, start.normal_bias, start.activations, iterate.velocities, forces)
+        """Predict the end of the step under the activations of the previous step, which ``start`` contains (Eq. 12);
+        see ``predict_end``."""
+        tension = MuscleEnergy.of(self.muscles, start.activations)
+        response, velocities, forces = predict_end(self.linearizer, self.factors, start, tension)
+        return PredictedStep(response, start.normal_bias, start.activations, velocities, forces)
 
     def _finish(
         self, problem: StepProblem, plan: Plan, result: CoupledResult, clock: StageClock

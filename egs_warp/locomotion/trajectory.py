@@ -90,7 +90,7 @@ class Trajectory:
     contact_weights: np.ndarray
     """(C, 4) barycentric weights of the contact point."""
     contact_plane: np.ndarray
-    """(C,) int32, row of ``planes``; 0 is the ground, flat or not."""
+    """(C,) int32, row of ``planes``; 0 is the ground, flat or not. -1 - k is a contact with body k of the world."""
     contact_normal: np.ndarray
     """(C, 3) unit normal of the contact plane, or of uneven ground below the contact at the start of the step."""
     contact_force: np.ndarray
@@ -142,9 +142,14 @@ class Trajectory:
     relative_stiffness: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(T,) Young's modulus of each element relative to ``young_modulus``; empty if it is the same everywhere."""
 
+    @property
+    def capture_frame(self) -> BodyFrame:
+        """Placement of this frame in the capture."""
+        return BodyFrame(self.body_axes, self.body_origin, self.metres_per_unit)
+
     def in_capture(self, points: np.ndarray) -> np.ndarray:
         """Transform ``points`` (..., 3) m from this frame to the frame and unit of the capture."""
-        return BodyFrame(self.body_axes, self.body_origin, self.metres_per_unit).capture_points(points)
+        return self.capture_frame.capture_points(points)
 
     def with_plan(self, planned_com: np.ndarray) -> Trajectory:
         """Return a copy with the planned centre of mass, (F+1, 3) m."""

@@ -58,6 +58,8 @@ _INDICES = {
     "kick_step": "steps",
 }
 """Extent below which all values of each integer array must be."""
+MAX_BODIES = 10_000
+"""Maximum number of bodies of a world; contacts with them have negative values of ``contact_plane``."""
 _POSITIVE = ("node_mass", "height", "metres_per_unit", "ground_spacing", "dt", "relative_stiffness")
 _MAY_BE_NAN = ("planned_com", "min_gap")
 """Arrays that may contain NaN: where there is no plan or no contact point."""
@@ -79,8 +81,10 @@ def check_trajectory(t: Trajectory) -> None:
         if name in _POSITIVE and not (values > 0.0).all():
             raise ValueError(f"{name} is not positive")
     for name, below in _INDICES.items():
-        values = getattr(t, name)
-        if values.dtype.kind not in "iu" or (values.size and not 0 <= values.min() <= values.max() < extents[below]):
+        values, least = getattr(t, name), -MAX_BODIES if name == "contact_plane" else 0
+        if values.dtype.kind not in "iu" or (
+            values.size and not least <= values.min() <= values.max() < extents[below]
+        ):
             raise ValueError(f"{name} has an index out of range")
     starts = t.muscle_end_starts
     if (

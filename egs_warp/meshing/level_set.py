@@ -15,7 +15,7 @@ from scipy.spatial import Delaunay
 
 from egs_warp.errors import UserError
 from egs_warp.kernels.contact.level_set import LevelSetLattice, level_set_kernel
-from egs_warp.kernels.meshing.surface_distance import surface_distance_kernel
+from egs_warp.kernels.meshing.surface_distance import surface_distance_kernel, unsigned_distance_kernel
 from egs_warp.launching import Device, empty, launch_rows
 from egs_warp.meshing.occupancy import LatticeSolid
 from egs_warp.precision import Vec3, real
@@ -77,6 +77,10 @@ class LevelSet:
         extended = np.pad(values, _FILTER_MARGIN, mode="reflect", reflect_type="odd")
         coefficients = ndimage.spline_filter(extended, order=2, output=np.float64, mode="mirror")[margin]
         return cls(np.asarray(origin, float), float(spacing), np.asarray(coefficients, np.float32))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the numbers; the cached structs and arrays of Warp cannot be pickled."""
+        return LevelSet, (self.origin, self.spacing, self.coefficients)
 
     @cached_property
     def lattice(self) -> Any:
@@ -158,8 +162,10 @@ def level_set_of_body(solid: LatticeSolid, points: np.ndarray) -> LevelSet:
     shape = _moved_to_points(shape, (outer - origin) / spacing)
     vertices, faces, _, _ = measure.marching_cubes(shape, 0.0)
     vertices = origin + spacing * vertices.astype(np.float64)
+    counts = np.array(inside.shape)
+    # The surface separates the nodes by the sign of ``shape``.
     return LevelSet.through(
-        origin, spacing, _signed_distances(vertices, faces, origin, spacing, np.array(inside.shape))
+        origin, spacing, _signed_distances(vertices, faces, origin, spacing, counts, inside=shape < 0.0)
     )
 
 
@@ -239,26 +245,34 @@ def _moved_to_points(values: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def _signed_distances(
-    vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, spacing: float, counts: np.ndarray
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    origin: np.ndarray,
+    spacing: float,
+    counts: np.ndarray,
+    *,
+    inside: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the distances (nx, ny, nz) m of lattice nodes from a closed surface, negative inside."""
+    """Return the distances (nx, ny, nz) m of lattice nodes from a closed surface, negative inside. ``inside`` (nx, ny,
+    nz) is the mask of the nodes inside; None finds them by the winding number of the surface."""
     device = wp.get_device("cpu")
     centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     with wp.ScopedDevice(device):
         mesh = wp.Mesh(
             points=wp.array((vertices - centre).astype(np.float32), dtype=wp.vec3),
             indices=wp.array(np.ascontiguousarray(faces).ravel(), dtype=wp.int32),
-            support_winding_number=True,
+            support_winding_number=inside is None,
         )
         nodes = origin - centre + spacing * np.moveaxis(np.indices(tuple(counts.tolist())), 0, -1).reshape(-1, 3)
         points = wp.array(nodes.astype(np.float32), dtype=wp.vec3)
         distances = empty(len(nodes), wp.float32, device)
     reach = spacing * float(np.linalg.norm(counts))
     launch_rows(
-        surface_distance_kernel,
+        surface_distance_kernel if inside is None else unsigned_distance_kernel,
         len(nodes),
         inputs=[mesh.id, points, reach],
         outputs=[distances],
         device=device,
     )
-    return distances.numpy().astype(np.float64).reshape(counts)
+    values = distances.numpy().astype(np.float64).reshape(counts)
+    return values if inside is None else np.where(inside, -values, values)

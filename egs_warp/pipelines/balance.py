@@ -13,9 +13,10 @@ from egs_warp.locomotion.planner import MIN_STEPS_PER_TIME_UNIT
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.push import Push
-from egs_warp.pipelines.creature import Creature, CreatureOptions, PlacedCage, creature_in_cage, initial_stance
+from egs_warp.pipelines.creature import Creature, CreatureOptions, creature_in_cage, initial_stance
 from egs_warp.pipelines.end_state import MAX_END_TILT, has_upright_pose
 from egs_warp.pipelines.facing_direction import Front
+from egs_warp.pipelines.placed_cage import PlacedCage
 from egs_warp.pipelines.simulated_run import MIN_FRAMES, simulate
 
 _STAND_TIME = 6.0

@@ -15,7 +15,8 @@ from egs_warp.fem.implicit_step import UNSOLVABLE, UnsolvableStepError
 from egs_warp.launching import available_threads
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
-from egs_warp.pipelines.creature import Creature, checked_friction
+from egs_warp.pipelines.captured_body import checked_friction
+from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.job import Job, RunSummary
 from egs_warp.pipelines.simulated_run import check_frames, checked_activations
 from egs_warp.pipelines.worker_pool import ProgressCallback, TaskResult, run_task

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.contact.detection import ContactGeometry, contact_geometry
-from egs_warp.contact.terrain import Solid, Surface
+from egs_warp.contact.detection import contact_geometry
+from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
@@ -19,27 +19,32 @@ from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
-from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
-from egs_warp.io.capture import Capture
+from egs_warp.geometry.tetmesh import mean_edge_length
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.settling import SHAPE_TOLERANCE, settle, settle_as_captured
 from egs_warp.locomotion.stepper import LocomotionStepper
-from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame, representatives
-from egs_warp.meshing.cage import Cage, cage_of_body, cage_of_mesh
-from egs_warp.meshing.cage_file import read_cage_in
-from egs_warp.meshing.occupancy import solid_from_gaussians
+from egs_warp.meshing.cage import Cage
 from egs_warp.meshing.protrusions import find_protrusions
 from egs_warp.motions.feet import SupportKind, support_kind_of
-from egs_warp.motions.limbs import Limbs, Sections, find_limbs
+from egs_warp.motions.limbs import Limbs
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import GroundFrame
 from egs_warp.motions.style import MAX_OVERLAP, Style
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
-from egs_warp.pipelines.facing_direction import Front, find_front
-from egs_warp.segmentation.base_plane import find_base_plane, guess_up
-from egs_warp.short_repr import short_repr
+from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, points_at_rest
+from egs_warp.pipelines.facing_direction import Front
+from egs_warp.pipelines.placed_cage import (
+    PlacedCage,
+    check_front,
+    check_height,
+    choose_front,
+    estimated_up,
+    place_cage,
+    plane_below,
+    simulation_device,
+)
 
 MIN_SAG = 0.004
 """Minimum sag, as a fraction of the height. The sag of a body that its weight bends too much is halved repeatedly, but
@@ -51,16 +56,10 @@ MAX_SLOPE = 45.0
 """Maximum slope of the ground, degrees; steeper ground is rejected."""
 _GROUND_SPACING = 0.5
 """Spacing of the nodes of uneven ground, in mean cage edges; contact points are 0.4 of an edge apart."""
-_CAGE_BITS = 32
-"""Number of bits to which the cage's coordinates are rounded, relative to the height."""
 _CONTACT_GRID = 2.0**-10
 """Fraction of the height to which contact points are rounded. Jumps are sensitive to the last bits of coordinates,
 which change if a capture is rotated or its unit changes.
 """
-_FRONT_GRID = np.pi / 2**12
-"""Angle to a multiple of which the facing direction is rounded, radians, for the same reason as ``_CONTACT_GRID``."""
-_FOOT_HEIGHT = 0.1
-"""Fraction of the height above uneven ground below which parts of the object may touch it."""
 MAX_FRICTION = 10.0
 """Maximum Coulomb coefficient of ``CreatureOptions``."""
 
@@ -70,7 +69,9 @@ class CreatureOptions:
     """Options of ``make_creature``; vectors, planes and surfaces are in the frame and units of the capture."""
 
     metres_per_unit: float | None = None
-    """Length of one unit of the capture, m; None makes the body 1 m tall."""
+    """Length of one unit of the capture, m; None uses ``height``."""
+    height: float | None = None
+    """Height of the body, m; None makes it 1 m tall."""
     sag: float = DEFAULT_SAG
     """Fraction of the body height by which the body sags under its weight; it defines the stiffness. The stiffness is
     increased if the weight would bend the body out of shape."""
@@ -110,63 +111,29 @@ class CreatureOptions:
             # The bounds keep lengths within the range of single precision; ``make_body`` checks the height of the body.
             advice = "give a positive number, from 1e-9 to 1e9"
             raise ArgumentError("metres_per_unit", advice, value=self.metres_per_unit)
+        check_height(self.height, self.metres_per_unit)
 
 
-@dataclass(frozen=True)
-class Creature:
-    """A capture with a cage, a body, muscles and a ground, at rest; metres, all in the frame of the body."""
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Creature(CapturedBody):
+    """A capture with a cage, a body, muscles and a ground, at rest; metres."""
 
-    __repr__ = short_repr
-
-    frame: BodyFrame
-    """Frame of the body in the capture."""
-    cloud: GaussianCloud
-    """The Gaussians of the capture, in their original order."""
     front: Front
-    """Direction in which the body faces and moves."""
+    """Direction in which the body faces and moves, at ``start``."""
     limbs: Limbs
     """Limbs on which the body stands."""
     cage: Cage
     """Tetrahedral mesh around the Gaussians."""
-    stepper: LocomotionStepper
-    """Solver with body, muscles and contact."""
-    start: BodyState
-    """State at rest on the ground."""
-    solids: tuple[Surface, ...]
-    """Surfaces that the body can touch, the ground first."""
-    notes: tuple[str, ...] = ()
-    """Guesses about the capture, for the user."""
     overlap: float = 0.0
     """Softness of the parts that stick out (``CreatureOptions``)."""
 
-    def placed(self, cloud: GaussianCloud) -> GaussianCloud:
-        """Transform another cloud of the same capture, such as its background, to the frame of the body."""
-        return to_body_frame(cloud, self.frame)
-
-    def with_friction(self, friction: float) -> Creature:
-        """Return the same body at rest on ground with another Coulomb coefficient.
-
-        Raises ``ArgumentError`` for a negative one.
-        """
-        old = self.stepper
-        geometry, device = replace(old.geometry, friction=checked_friction(friction)), str(old.body.assembly.device)
-        stepper = LocomotionStepper(old.body, old.muscles, geometry, settings=old.settings, device=device)
-        return replace(self, stepper=stepper, start=settle(stepper))
-
-    @property
-    def body(self) -> SoftBody:
-        """The soft body."""
-        return self.stepper.body
-
-    @property
-    def muscles(self) -> MuscleSet:
-        """The muscles of the body."""
-        return self.stepper.muscles
-
-    @property
-    def geometry(self) -> ContactGeometry:
-        """Contact points, planes and friction."""
-        return self.stepper.geometry
+    def _moved(self, turn: np.ndarray, shift: np.ndarray) -> Creature:
+        front = self.front
+        alternative = None if front.alternative is None else turn @ front.alternative
+        return replace(
+            super()._moved(turn, shift),
+            front=replace(front, direction=turn @ front.direction, alternative=alternative),
+        )
 
 
 def make_creature(
@@ -217,6 +184,7 @@ def make_creature(
         up=up,
         plane=plane,
         metres_per_unit=options.metres_per_unit,
+        height=options.height,
         nodes=options.nodes,
         cage_file=options.cage_file,
     )
@@ -241,7 +209,7 @@ def creature_in_cage(
         progress: Called with the name of each stage as it starts.
     """
     progress("contact")
-    device, frame, cage = _simulation_device(cloud), standing.frame, standing.cage
+    device, frame, cage = simulation_device(cloud), standing.frame, standing.cage
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in options.solids)
     field = None
     if options.ground is not None:
@@ -273,38 +241,20 @@ def creature_in_cage(
         progress("stand")
         stepper, start, is_stiff_enough = _rest_state(stepper, standing.limbs)
         if is_stiff_enough or sag < MIN_SAG:
-            surfaces = (field or Solid((GROUND,)), *solids)
-            placed = to_body_frame(cloud, frame)
             return Creature(
-                frame, placed, facing, standing.limbs, cage, stepper, start, surfaces, notes, options.overlap
+                frame=frame,
+                cloud=to_body_frame(cloud, frame),
+                front=facing,
+                limbs=standing.limbs,
+                cage=cage,
+                stepper=stepper,
+                start=start,
+                solids=(field or Solid((GROUND,)), *solids),
+                shape=CapturedShape(standing.gaussians, points_at_rest(geometry)),
+                notes=notes,
+                overlap=options.overlap,
             )
         sag *= 0.5
-
-
-def estimated_up(cloud: GaussianCloud, *, advice: str) -> tuple[np.ndarray, str]:
-    """Return the up direction (3,) of a capture, from its file or else estimated. The second result is a note for the
-    user, which ends with ``advice``."""
-    file_up, vertical_axis = (cloud.up, cloud.vertical_axis) if isinstance(cloud, Capture) else (None, None)
-    up, reason = guess_up(cloud, file_up, vertical_axis=vertical_axis)
-    axis = int(np.argmax(np.abs(up)))
-    is_axis = np.abs(up[axis]) == 1.0
-    name = f"{'-' if up[axis] < 0 else '+'}{'xyz'[axis]}" if is_axis else ",".join(f"{x:.3f}" for x in up)
-    verb = "is" if file_up is not None else "is estimated as"
-    return up, f"up {verb} {name} ({reason}); if that is wrong, {advice}"
-
-
-def plane_below(cloud: GaussianCloud, ground: HeightField) -> Plane:
-    """Return the reference plane of ``ground``, moved to the lowest ground under the object's foot.
-
-    Raises ``ArgumentError`` if no part of ``cloud`` is above the ground.
-    """
-    means = cloud.means.numpy()[cloud.opacities() > 0.3].astype(np.float64)
-    heights = ground.heights(means)
-    if len(means) == 0 or not (heights > 0.0).any():
-        raise ArgumentError("ground", "no part of the object lies above it; check the plane", check=("plane",))
-    low = means[(heights > 0.0) & (heights < _FOOT_HEIGHT * float(np.quantile(heights, 0.99)))]
-    lift = float(ground.ground_height(low).min()) if len(low) else 0.0
-    return Plane(ground.normal, ground.plane.offset - lift)
 
 
 def changed_creature(creature: Creature, *, friction: float, sag: float, muscles_file: Path | None) -> Creature:
@@ -316,7 +266,7 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
         sag: Fraction of its height by which the body sags, which defines the stiffness (``make_body``).
         muscles_file: Muscles (``body_muscles``); the automatic ones depend on the stiffness.
     """
-    device = _simulation_device(creature.cloud)
+    device = simulation_device(creature.cloud)
     body, geometry = creature.body, replace(creature.geometry, friction=friction)
     up = -body.gravity / np.linalg.norm(body.gravity)
     new_body = make_body(creature.cage.mesh, GROUND, up=up, sag=sag, device=device)
@@ -325,111 +275,6 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
     stepper = LocomotionStepper(new_body, muscles, geometry, settings=creature.stepper.settings, device=device)
     stepper, start, _ = _rest_state(stepper, creature.limbs)
     return replace(creature, stepper=stepper, start=start)
-
-
-def _simulation_device(cloud: GaussianCloud) -> str:
-    """Return the device on which the body's steps are computed.
-
-    It is the device of ``cloud``, or the CPU if PyTorch is missing or cannot use the GPU: on a GPU, the matrices of the
-    steps are PyTorch tensors.
-    """
-    if cloud.device.is_cpu:
-        return str(cloud.device)
-    try:
-        import torch
-    except ImportError:
-        return "cpu"
-    return str(cloud.device) if torch.cuda.is_available() else "cpu"
-
-
-@dataclass(frozen=True)
-class PlacedCage:
-    """The cage of a capture, in metres and in the frame of the body."""
-
-    __repr__ = short_repr
-
-    frame: BodyFrame
-    """Frame of the body in the capture."""
-    gaussians: GaussianCloud
-    """Gaussians that define the body (``body_gaussians``); in a large capture, these are a subset
-    (``representatives``)."""
-    cage: Cage
-    """Tetrahedral mesh around the Gaussians."""
-    limbs: Limbs
-    """Limbs on which the body stands, detected in the captured solid."""
-
-
-def place_cage(
-    cloud: GaussianCloud,
-    *,
-    up: np.ndarray | None = None,
-    plane: Plane | None = None,
-    metres_per_unit: float | None = None,
-    nodes: int = 500,
-    cage_file: Path | None = None,
-) -> PlacedCage:
-    """Find the body's frame on its ground plane, and build its cage in that frame.
-
-    Args:
-        cloud: The capture.
-        up: (3,) Up in the capture; if there is no ``plane``, the ground is the object's base, orthogonal to ``up``.
-        plane: Ground plane in the capture.
-        metres_per_unit: Length of one unit of the capture, m; None makes the body 1 m tall.
-        nodes: Approximate number of cage nodes.
-        cage_file: File with the tetrahedra of the cage (``read_cage_mesh``); None generates them.
-    """
-    near, anchor = centred(representatives(cloud))
-    if plane is None:
-        assert up is not None, "make_creature requires plane or up"
-        plane = find_base_plane(near, up)
-    else:
-        plane = plane.moved(-anchor)
-    frame = find_body_frame(near, plane)
-    gaussians = body_gaussians(near, frame)
-    solid = solid_from_gaussians(gaussians)
-    if cage_file is None:
-        cage = cage_of_body(gaussians, target_nodes=nodes, solid=solid)
-    else:
-        cage = cage_of_mesh(gaussians, read_cage_in(cage_file, frame.moved(anchor)), solid)
-    metres = 1.0 / cage.height(GROUND) if metres_per_unit is None else metres_per_unit / frame.scale
-    cage = _rounded(cage.scaled(metres))
-    limbs = find_limbs(Sections.of_solid(solid.scaled(metres), cage.mesh), cage.mesh.nodes)
-    return PlacedCage(frame.moved(anchor).scaled(metres), gaussians.scaled(metres), cage, limbs)
-
-
-def _rounded(cage: Cage) -> Cage:
-    """Round the coordinates to ``_CAGE_BITS``: the last bits depend on the unit of the capture."""
-    step = 2.0 ** (np.rint(np.log2(cage.height(GROUND))) - _CAGE_BITS)
-    return replace(cage, mesh=TetMesh(step * np.rint(cage.mesh.nodes / step), cage.mesh.tets))
-
-
-def choose_front(
-    standing: PlacedCage, front: np.ndarray | None = None, *, seen_from: np.ndarray | None = None
-) -> Front:
-    """Return the facing direction: ``front`` (3,) if given, otherwise the estimate of ``find_front``.
-
-    Args:
-        standing: The body.
-        front: (3,) Facing direction in the capture's frame.
-        seen_from: (3,) Mean of the unit vectors from the object to the cameras of its photos, in the capture's frame.
-    """
-    axes = standing.frame.axes
-    if front is None:
-        seen_in_body_frame = None if seen_from is None else axes @ seen_from
-        mesh = standing.cage.mesh
-        lies = support_kind_of(mesh, mesh.nodes[:, 2], standing.limbs.count) is SupportKind.LYING
-        estimate = find_front(standing.gaussians, mesh, seen_from=seen_in_body_frame, lengthwise=lies)
-        angle = _FRONT_GRID * np.rint(np.arctan2(estimate.direction[1], estimate.direction[0]) / _FRONT_GRID)
-        return replace(estimate, direction=np.array([np.cos(angle), np.sin(angle), 0.0]))
-    x, y, _ = axes @ front
-    return Front(np.array([x, y, 0.0]) / np.hypot(x, y), None)
-
-
-def check_front(up: np.ndarray, front: np.ndarray) -> None:
-    """Raise ``ArgumentError`` if ``front`` (3,) is parallel to ``up`` (3,)."""
-    if np.linalg.norm(np.cross(front, up)) < 1e-3 * np.linalg.norm(front) * np.linalg.norm(up):
-        given = ",".join(f"{x:g}" for x in front)
-        raise ArgumentError("front", "points up or down; give a direction along the ground", value=given)
 
 
 def _check_slope(normal: np.ndarray, up: np.ndarray) -> None:
@@ -520,13 +365,6 @@ def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
     gaps, _ = stepper.detector.gaps(start.positions)
     upright = np.trace(turn) > 1.0 + 2.0 * np.cos(np.radians(10.0))
     return bool(np.linalg.norm(moved) < 0.04 * body.height and upright and gaps.min() > -0.01 * body.height)
-
-
-def checked_friction(friction: float) -> float:
-    """Return the Coulomb coefficient ``friction``. Raises ``ArgumentError`` if it is negative or not finite."""
-    if not 0.0 <= friction < np.inf:
-        raise ArgumentError("friction", "give a Coulomb coefficient of at least 0", value=friction)
-    return friction
 
 
 def initial_stance(creature: Creature, *, step: float | None = None, style: Style | None = None) -> Stance:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from time import perf_counter
+from typing import TypeVar
 
 import numpy as np
 import warp as wp
 
-from egs_warp.deformation.deformer import Deformer
+from egs_warp.deformation.deformer import DeformedGaussians, Deformer
 from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.deformation.splitting import split_for_motion
 from egs_warp.geometry.body_frame import GROUND
@@ -27,13 +28,14 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.progress import render_bar
 from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
-from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, FILMED_FROM, SimulatedRun
+from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, FILMED_FROM, BodyResult, SimulatedRun
 from egs_warp.render.backdrop import Backdrop, captured_scene, plain_colour, studio_floor
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.render.shadow import ContactShadow, shadow_blur_radius
 from egs_warp.short_repr import short_repr
 
+Pose = TypeVar("Pose")
 SHEET_FRAMES = 12
 """Number of frames on the contact sheet."""
 SPLIT_KEY_FRAMES = 24
@@ -125,12 +127,12 @@ def draw_film(
     camera = resized(performance.camera(size, view_from, scene=scene), *(shot.size or (size, size)))
     cameras = shot.cameras(camera, trajectory, steps, in_scene=scene is not None)
     # The whole motion is known, so Gaussians are split before the first frame and no frame shows a sudden change.
-    started = time.perf_counter()
+    started = perf_counter()
     deformer = drawn = split_deformer(performance, in_scene=scene is not None)
     if max_gaussians is not None and deformer.rest.count > max_gaussians:
         visible = most_visible(deformer.rest, max_gaussians)
         drawn = Deformer(visible, embed_gaussians(visible, creature.cage.mesh))
-    splitting = 1e3 * (time.perf_counter() - started)
+    splitting = 1e3 * (perf_counter() - started)
     frames = drawn_frames(
         drawn,
         trajectory,
@@ -141,44 +143,74 @@ def draw_film(
         shadow=shadow,
         light=placed_light,
     )
-    milliseconds: dict[str, list[float]] = {"deform": [], "render": [], "encode": []}
-    sheet_images: list[np.ndarray] = []
-    sheet_indices = np.unique(np.linspace(0, len(steps) - 1, SHEET_FRAMES).round().astype(int))
-    path = run.file(f"{name}.{'mov' if shot.transparent else 'mp4'}")
-    with (
-        _writer(path, cameras[0], shot) as video,
-        render_bar(len(steps), quiet=quiet) as show_image,
-    ):
-        for index, frame in enumerate(frames):
-            started = time.perf_counter()
-            image = frame.picture()
-            video.write(image)
-            if index in sheet_indices:
-                sheet_images.append(_over_white(image))
-            encoding = 1e3 * (time.perf_counter() - started)
-            for stage, spent in zip(milliseconds, (*frame.milliseconds, encoding), strict=True):
-                milliseconds[stage].append(spent)
-            show_image()
-    labels = [f"{trajectory.time[steps[i]]:.2f} s" for i in sheet_indices]
-    write_png(run.file("sheet.png"), contact_sheet(sheet_images, 4, labels))
+    path, milliseconds = encode_film(frames, run, name, cameras[0], shot, trajectory.time[steps], quiet=quiet)
     milliseconds["split"] = [splitting / len(steps)]
     return Film(path.name, deformer, camera, milliseconds)
 
 
-def split_deformer(performance: SimulatedRun, *, in_scene: bool = False) -> Deformer:
-    """Return the deformer of the Gaussians of a run, split for its motion.
+def encode_film(
+    frames: Iterable[Frame],
+    run: RunFolder,
+    name: str,
+    camera: Camera,
+    shot: Shot,
+    time: np.ndarray,
+    *,
+    quiet: bool = False,
+) -> tuple[Path, dict[str, list[float]]]:
+    """Write the video ``name`` and ``sheet.png`` into the folder of ``run``.
 
     Args:
-        performance: The simulated run.
-        in_scene: True if a captured scene is drawn around the creature.
+        frames: The frames, which are rendered while they are written.
+        run: Folder for the files.
+        name: Name of the video, without its ending.
+        camera: Camera of the first frame.
+        shot: Frame rate and transparency.
+        time: (n,) s, time of each frame.
+        quiet: Show no progress bar.
+
+    Returns:
+        The path of the video, and the time of each frame by stage, ms.
     """
-    creature, simulation = performance.creature, performance.simulation
-    trajectory, cloud = simulation.trajectory, creature.cloud
-    keys = simulation.frames[:: max(1, len(simulation.frames) // SPLIT_KEY_FRAMES)]
-    embedding = embed_gaussians(cloud, creature.cage.mesh)
+    milliseconds: dict[str, list[float]] = {"deform": [], "render": [], "encode": []}
+    sheet_images: list[np.ndarray] = []
+    sheet_indices = np.unique(np.linspace(0, len(time) - 1, SHEET_FRAMES).round().astype(int))
+    path = run.file(f"{name}.{'mov' if shot.transparent else 'mp4'}")
+    with (
+        _writer(path, camera, shot) as video,
+        render_bar(len(time), quiet=quiet) as show_image,
+    ):
+        for index, frame in enumerate(frames):
+            started = perf_counter()
+            image = frame.picture()
+            video.write(image)
+            if index in sheet_indices:
+                sheet_images.append(_over_white(image))
+            encoding = 1e3 * (perf_counter() - started)
+            for stage, spent in zip(milliseconds, (*frame.milliseconds, encoding), strict=True):
+                milliseconds[stage].append(spent)
+            show_image()
+    labels = [f"{time[i]:.2f} s" for i in sheet_indices]
+    write_png(run.file("sheet.png"), contact_sheet(sheet_images, 4, labels))
+    return path, milliseconds
+
+
+def split_deformer(performance: BodyResult, *, in_scene: bool = False) -> Deformer:
+    """Return the deformer of the Gaussians of a body, split for its motion. A prop moves affinely, so it is not split.
+
+    Args:
+        performance: The simulated body.
+        in_scene: True if a captured scene is drawn around the body.
+    """
+    body, simulation = performance.body, performance.simulation
+    trajectory, cloud, mesh = simulation.trajectory, body.cloud, body.mesh
     if not in_scene and trajectory.ground_coefficients.size == 0:
         # Hide the haze of the captured ground, which would be visible below a jumping creature.
         cloud = hidden_below(cloud, GROUND, margin=_BELOW_GROUND * trajectory.height)
+    if len(mesh.tets) == 1:
+        return Deformer(cloud, embed_gaussians(cloud, mesh))
+    keys = simulation.frames[:: max(1, len(simulation.frames) // SPLIT_KEY_FRAMES)]
+    embedding = embed_gaussians(body.cloud, mesh)
     split = split_for_motion(cloud, embedding, [trajectory.positions[step] for step in keys])
     return Deformer(split.cloud, split.embedding)
 
@@ -206,23 +238,68 @@ def drawn_frames(
         shadow: Draw a shadow on the ground.
         light: Main light, in the axes of the body; None as for ``draw_film``.
     """
-    path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
-    grain, device = shadow_blur_radius(deformer.rest), deformer.rest.device
     # The shape of uneven ground is not drawn, so its plane must not hide a creature in a hollow.
     is_flat = trajectory.ground_coefficients.size == 0
-    relighter = None if light is None else Relighter(deformer.rest, light)
+    filmed = Filmed(path_of(trajectory), trajectory.height, is_flat)
+    poses = (trajectory.positions[step] for step in steps)
+    return rendered_frames(
+        deformer.deform, deformer.rest, poses, filmed, cameras, shot, scene=scene, shadow=shadow, light=light
+    )
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """Extent of a filmed motion, from which its ground and shadow follow."""
+
+    path: np.ndarray
+    """(n, 3) m, centres of mass of the bodies over the motion."""
+    height: float
+    """Height of the highest body, m."""
+    is_flat: bool = True
+    """True if the ground is flat and hides what is below it."""
+
+
+def path_of(trajectory: Trajectory) -> np.ndarray:
+    """Return the path (F + 1, 3) m of the centre of mass."""
+    return np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
+
+
+def rendered_frames(
+    deform: Callable[[Pose], DeformedGaussians],
+    rest: GaussianCloud,
+    poses: Iterable[Pose],
+    filmed: Filmed,
+    cameras: Sequence[Camera],
+    shot: Shot,
+    *,
+    scene: GaussianCloud | None = None,
+    shadow: bool = True,
+    light: MainLight | None = None,
+) -> Iterator[Frame]:
+    """Render one frame for each pose.
+
+    Args:
+        deform: Deforms the Gaussians ``rest`` to a pose.
+        rest: Gaussians at rest.
+        poses: Pose of each frame.
+        filmed: Extent of the motion.
+        cameras: Camera of each frame.
+        shot, scene, shadow, light: As for ``drawn_frames``.
+    """
+    grain, device = shadow_blur_radius(rest), rest.device
+    relighter = None if light is None else Relighter(rest, light)
     setting: Backdrop | None = None
-    for index, (step, camera) in enumerate(zip(steps, cameras, strict=True)):
-        marks = [time.perf_counter()]
-        deformed = deformer.deform(trajectory.positions[step])
+    for index, (pose, camera) in enumerate(zip(poses, cameras, strict=True)):
+        marks = [perf_counter()]
+        deformed = deform(pose)
         cloud = deformed.cloud if relighter is None else relighter.relight(deformed.cloud, deformed.rotations)
-        marks.append(time.perf_counter())
+        marks.append(perf_counter())
         if setting is None or camera is not cameras[index - 1]:
             setting = _backdrop_of(
-                path, trajectory.height, camera, scene, shot, grain=grain, shadow=shadow, light=light, device=device
+                filmed.path, filmed.height, camera, scene, shot, grain=grain, shadow=shadow, light=light, device=device
             )
-        image, shade = _rendered(cloud, setting, transparent=shot.transparent, has_floor=is_flat)
-        marks.append(time.perf_counter())
+        image, shade = _rendered(cloud, setting, transparent=shot.transparent, has_floor=filmed.is_flat)
+        marks.append(perf_counter())
         deforming, rendering = (1e3 * np.diff(marks)).tolist()
         yield Frame(image, shade, (deforming, rendering))
 
@@ -261,10 +338,10 @@ def picture_seconds(creature: Creature, *, size: tuple[int, int], shadow: bool =
     spent = []
     # The first picture may compile kernels.
     for _ in range(2):
-        started = time.perf_counter()
+        started = perf_counter()
         image, shade = _rendered(deformer.deform(positions).cloud, setting, transparent=False, has_floor=True)
         Frame(image, shade, (0.0, 0.0)).picture()
-        spent.append(time.perf_counter() - started)
+        spent.append(perf_counter() - started)
     return spent[-1]
 
 

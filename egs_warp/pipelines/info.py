@@ -33,8 +33,9 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.plot import FIBRE_COLOURS
 from egs_warp.pipelines.balance import own_muscles_notes
 from egs_warp.pipelines.capture_warnings import capture_warnings
-from egs_warp.pipelines.creature import PlacedCage, body_muscles, check_front, choose_front, place_cage
+from egs_warp.pipelines.creature import body_muscles
 from egs_warp.pipelines.facing_direction import Front
+from egs_warp.pipelines.placed_cage import PlacedCage, check_front, choose_front, place_cage
 from egs_warp.render.rasteriser import render_gaussians
 
 if TYPE_CHECKING:

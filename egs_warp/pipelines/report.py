@@ -20,7 +20,7 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory, measure
 from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.sequence import MotionRecord, spans_of
-from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.captured_body import CapturedBody
 from egs_warp.pipelines.end_state import EndCause, State
 from egs_warp.short_repr import short_repr
 from egs_warp.version import __version__
@@ -204,8 +204,8 @@ class GaussianCounts:
     """Fraction of the opacity of the Gaussians that are not used for contact."""
 
     @classmethod
-    def of(cls, creature: Creature, drawn: int | None = None) -> GaussianCounts:
-        """Return the counts of a creature; ``drawn`` is the number in its pictures, None if there was no splitting."""
+    def of(cls, creature: CapturedBody, drawn: int | None = None) -> GaussianCounts:
+        """Return the counts of a body; ``drawn`` is the number in its pictures, None if there was no splitting."""
         read, geometry = creature.cloud.count, creature.geometry
         return cls(read, read if drawn is None else drawn, geometry.excluded_count, geometry.excluded_opacity)
 
@@ -336,8 +336,13 @@ def verdict(result: Audit) -> str:
     return f"audit: FAILED: {', '.join(exceeded)}" if exceeded else "audit: passed"
 
 
+def has_failed_audit(result: Audit) -> bool:
+    """Return True if a value of ``result`` exceeds its limit."""
+    return any(not value <= AUDIT_LIMITS[name] for name, value in asdict(result).items())
+
+
 def report_of_run(
-    creature: Creature,
+    creature: CapturedBody,
     trajectory: Trajectory,
     steps: Sequence[StepReport],
     frames: np.ndarray,
@@ -357,7 +362,7 @@ def report_of_run(
     """Create the report of a run.
 
     Args:
-        creature: The creature.
+        creature: The creature, or a prop.
         trajectory: All states of the run.
         steps: Reports of all steps.
         frames: (n,) indices of the trajectory's states.
@@ -373,7 +378,7 @@ def report_of_run(
         film: Name of the video.
         takes: Simulations of the run, if there were several.
     """
-    mesh = creature.cage.mesh
+    mesh = creature.mesh
     return Report(
         source=source,
         motion=motion_reports(trajectory, done, ending or EndCause()),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -17,7 +17,6 @@ from egs_warp.geometry.camera import Camera, fitted_camera
 from egs_warp.geometry.frames import box_corners
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
-from egs_warp.locomotion.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from egs_warp.pipelines.report import JsonValue
@@ -48,6 +47,30 @@ class CameraMove(StrEnum):
     FIXED = "fixed"
     FOLLOW = "follow"
     ORBIT = "orbit"
+
+
+class FilmedMotion(Protocol):
+    """Node positions that a camera films: a ``Trajectory``, or the bodies of a world."""
+
+    @property
+    def time(self) -> np.ndarray:
+        """(F,) s, time of each state."""
+        ...
+
+    @property
+    def positions(self) -> np.ndarray:
+        """(F, N, 3) m, nodal positions."""
+        ...
+
+    @property
+    def node_mass(self) -> np.ndarray:
+        """(N,) kg."""
+        ...
+
+    @property
+    def capture_frame(self) -> BodyFrame:
+        """Frame of ``positions`` in the capture."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -88,7 +111,7 @@ class Shot:
             _keys(Path(self.camera))
 
     def cameras(
-        self, camera: Camera, trajectory: Trajectory, steps: np.ndarray, *, in_scene: bool = False
+        self, camera: Camera, trajectory: FilmedMotion, steps: np.ndarray, *, in_scene: bool = False
     ) -> list[Camera]:
         """Return the camera of each of the ``steps`` (n,) of a trajectory.
 
@@ -173,7 +196,7 @@ def framed(camera: Camera, points: np.ndarray) -> Camera:
     return fitted_camera(camera, points, sides=_SIDES, top=_TOP, bottom=_BOTTOM)
 
 
-def _following(camera: Camera, trajectory: Trajectory, steps: np.ndarray) -> list[Camera]:
+def _following(camera: Camera, trajectory: FilmedMotion, steps: np.ndarray) -> list[Camera]:
     """Return cameras that follow the centre of mass horizontally but not vertically, so that a jump looks high."""
     masses = trajectory.node_mass / trajectory.node_mass.sum()
     positions = trajectory.positions[steps]
@@ -209,10 +232,10 @@ def _shows(camera: Camera, points: np.ndarray) -> bool:
     return bool(min(u.min(), v.min()) > rim and u.max() < camera.width - rim and v.max() < camera.height - rim)
 
 
-def _through_keys(path: Path, camera: Camera, trajectory: Trajectory, steps: np.ndarray) -> list[Camera]:
+def _through_keys(path: Path, camera: Camera, trajectory: FilmedMotion, steps: np.ndarray) -> list[Camera]:
     """Return cameras on a spline through the keys of ``path`` (docs/guide/film.md), constant before and after them."""
     rows = _keys(path)
-    frame = BodyFrame(trajectory.body_axes, trajectory.body_origin, trajectory.metres_per_unit)
+    frame = trajectory.capture_frame
     rows[:, 1:4], rows[:, 4:7] = frame.points(rows[:, 1:4]), frame.points(rows[:, 4:7])
     times = np.clip(trajectory.time[steps] - trajectory.time[0], rows[0, 0], rows[-1, 0])
     line = CubicSpline(rows[:, 0], rows[:, 1:])(times) if len(rows) > 1 else np.repeat(rows[:, 1:], len(times), axis=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -17,8 +18,9 @@ from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.push import Push, PushKicks
 from egs_warp.motions.script import Script
 from egs_warp.motions.script import motion as script
-from egs_warp.motions.sequence import MotionSequence, Stance
+from egs_warp.motions.sequence import MotionRecord, MotionSequence, Stance
 from egs_warp.motions.style import Style
+from egs_warp.pipelines.captured_body import CapturedBody
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.end_state import EndCause
 from egs_warp.pipelines.planned_path import planned_com
@@ -51,6 +53,30 @@ _OCCLUSION_DISTANCE = 2.5
 """Approximate distance of the camera, in sizes of the filmed volume; Gaussians farther away are behind the camera."""
 
 
+class BodyResult(Protocol):
+    """Result of one body of a run: ``SimulatedRun`` of a creature, ``PropRun`` of a prop in a world."""
+
+    @property
+    def body(self) -> CapturedBody:
+        """Body at the start."""
+        ...
+
+    @property
+    def simulation(self) -> RolloutResult:
+        """Trajectory and reports of all steps."""
+        ...
+
+    @property
+    def records(self) -> Sequence[MotionRecord]:
+        """Records of the motions that have started."""
+        ...
+
+    @property
+    def ending(self) -> EndCause:
+        """Cause that ended the last motion early, if any."""
+        ...
+
+
 @dataclass(frozen=True)
 class SimulatedRun:
     """Result of ``simulate``."""
@@ -75,6 +101,16 @@ class SimulatedRun:
         return (
             f"SimulatedRun({names or 'nothing'}: {len(self.simulation.frames)} frames, {time[-1] - time[0]:.2f} s{end})"
         )
+
+    @property
+    def body(self) -> Creature:
+        """The creature, as the body of a world (``BodyResult``)."""
+        return self.creature
+
+    @property
+    def records(self) -> Sequence[MotionRecord]:
+        """Records of the motions that have started."""
+        return self.sequence.done
 
     @property
     def ending(self) -> EndCause:
@@ -182,6 +218,70 @@ def check_frames(frames: int | None) -> None:
         raise ArgumentError("frames", f"give at most {MAX_FRAMES}, which is an hour", value=frames)
 
 
+class Performer:
+    """The motions of one creature in a run: stance, sequence, fall monitor and time limit."""
+
+    def __init__(
+        self,
+        creature: Creature,
+        motion: Script | str,
+        *,
+        frames: int | None = None,
+        max_seconds: float | None = None,
+        step: float | None = None,
+        style: Style | None = None,
+        pushes: Sequence[Push] = (),
+        get_up: bool = True,
+    ) -> None:
+        """Prepare the motions; the arguments are described at ``simulate``."""
+        motion = script(motion) if isinstance(motion, str) else motion
+        self.creature, self.pushes = creature, tuple(pushes)
+        self.place = initial_stance(creature, step=step, style=style)
+        expected = motion.check(self.place)
+        self.sequence = MotionSequence(self.place, motion.parts(creature.body.height))
+        self.watch = FallMonitor(self.sequence, self.place, gets_up=get_up)
+        self.kicks = PushKicks(self.place, self.pushes)
+        # If a step is longer than 1/60 s, a frame has one step.
+        self._frame = max(1.0 / FRAME_RATE, step or 0.0)
+        self._limit = round(min(motion.frames(creature.body.height) / FRAME_RATE, max_seconds or np.inf) / self._frame)
+        self._max_frames = self._limit if frames is None else frames - 1
+        self._frames = frames
+        # The time for getting up is added to the limit.
+        self._get_up_frames = (
+            round(_MAX_GET_UP_TIME * creature.body.time_unit / self._frame) if get_up and frames is None else 0
+        )
+        self._remaining = RemainingFrames(self.sequence, expected, frame=self._frame, max_frames=self._max_frames)
+
+    @property
+    def frame_limit(self) -> int:
+        """Maximum number of frames after the first one."""
+        return self._max_frames + self._get_up_frames
+
+    @property
+    def is_over(self) -> bool:
+        """True if no number of frames was requested, and the motions have ended or their time limit is reached."""
+        watch = self.watch
+        time_limit = (self._limit - REST_FRAMES) * self._frame + watch.get_up_time
+        return self._frames is None and (watch.is_finished or watch.time + 1e-9 >= time_limit)
+
+    def expected_frames(self, done: int) -> int:
+        """Return the expected total number of frames after ``done`` frames."""
+        if self._frames is not None:
+            return self._max_frames
+        return max(done, self._remaining.frames(done, finished=self.watch.is_finished))
+
+    def result(self, simulation: RolloutResult, *, has_frame_count: bool | None = None) -> SimulatedRun:
+        """Return the result of the run. ``has_frame_count`` is True if its end was requested; None decides it by
+        ``frames``."""
+        trajectory = simulation.trajectory
+        trajectory = trajectory.with_plan(planned_com(self.sequence, self.creature.body, trajectory))
+        simulation = replace(simulation, trajectory=trajectory)
+        has_frame_count = self._frames is not None if has_frame_count is None else has_frame_count
+        return SimulatedRun(
+            self.creature, self.place, self.sequence, simulation, self.watch.fallen, self.pushes, has_frame_count
+        )
+
+
 def simulate(
     creature: Creature,
     motion: Script | str,
@@ -221,52 +321,36 @@ def simulate(
         UserError: The body cannot perform the motion, an argument is invalid, or ``resume`` belongs to another run.
     """
     check_frames(frames)
-    motion = script(motion) if isinstance(motion, str) else motion
     if activations is not None:
         activations = checked_activations(creature, activations, step)
-    get_up = get_up and not ends_at_fall
-    place = initial_stance(creature, step=step, style=style)
-    expected = motion.check(place)
-    sequence = MotionSequence(place, motion.parts(creature.body.height))
-    watch = FallMonitor(sequence, place, gets_up=get_up)
-    # If a step is longer than 1/60 s, a frame has one step.
-    frame = max(1.0 / FRAME_RATE, step or 0.0)
-    limit = round(min(motion.frames(creature.body.height) / FRAME_RATE, max_seconds or np.inf) / frame)
-    max_frames = limit if frames is None else frames - 1
-    # The time for getting up is added to the limit.
-    get_up_frames = round(_MAX_GET_UP_TIME * creature.body.time_unit / frame) if get_up and frames is None else 0
-
-    def is_over() -> bool:
-        return watch.is_finished or watch.time + 1e-9 >= (limit - REST_FRAMES) * frame + watch.get_up_time
-
-    remaining_frames = RemainingFrames(sequence, expected, frame=frame, max_frames=max_frames)
+    performer = Performer(
+        creature,
+        motion,
+        frames=frames,
+        max_seconds=max_seconds,
+        step=step,
+        style=style,
+        pushes=pushes,
+        get_up=get_up and not ends_at_fall,
+    )
     simulation = roll_out(
         creature.stepper,
         creature.geometry,
         creature.start,
-        watch,
-        frames=max_frames + get_up_frames,
+        performer.watch,
+        frames=performer.frame_limit,
         step=step,
         place=creature.frame,
         front=creature.front.direction,
         parts=parts,
         resume=resume,
-        finished=lambda: frames is None and is_over(),
-        aborted=lambda: ends_at_fall and watch.fallen is not None,
-        kicks=PushKicks(place, pushes),
+        finished=lambda: performer.is_over,
+        aborted=lambda: ends_at_fall and performer.watch.fallen is not None,
+        kicks=performer.kicks,
         activations=activations,
-        progress=lambda last: progress(
-            last + 1,
-            max(last + 1, remaining_frames.frames(last + 1, finished=watch.is_finished))
-            if frames is None
-            else max_frames,
-        ),
+        progress=lambda last: progress(last + 1, performer.expected_frames(last + 1)),
     )
-    trajectory = simulation.trajectory
-    trajectory = trajectory.with_plan(planned_com(sequence, creature.body, trajectory))
-    simulation = replace(simulation, trajectory=trajectory)
-    has_frame_count = frames is not None or activations is not None
-    return SimulatedRun(creature, place, sequence, simulation, watch.fallen, tuple(pushes), has_frame_count)
+    return performer.result(simulation, has_frame_count=True if activations is not None else None)
 
 
 def checked_activations(creature: Creature, activations: np.ndarray, step: float | None) -> np.ndarray:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.detection import ContactGeometry
-from egs_warp.contact.pair_contact import PairBody, PairContactDetector, PairContactSet
+from egs_warp.contact.pair_contact import PairBody, PairContactDetector
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.geometry.plane import Plane
@@ -38,7 +39,7 @@ def box(size: tuple[float, float, float], counts: tuple[int, int, int] = (2, 2, 
     embedding = embed_points(mesh, grid[on_surface], device="cpu")
     geometry = ContactGeometry(mesh, (FLOOR,), 0.5, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
     selector = ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3, device="cpu")
-    return PairBody(geometry, selector, level_set(size))
+    return PairBody(geometry, selector, level_set(size), mesh.nodes)
 
 
 def points_of(body: PairBody, positions: np.ndarray) -> np.ndarray:
@@ -50,11 +51,13 @@ def place(*bodies: tuple[PairBody, np.ndarray]) -> np.ndarray:
     return np.concatenate([body.geometry.mesh.nodes + shift for body, shift in bodies])
 
 
+NOTHING = np.zeros(0, int), np.zeros(0, bool)
+"""No contacts of a previous step."""
 SMALL, LARGE = (0.3, 0.3, 0.3), (1.0, 1.0, 0.4)
 
 
 @pytest.fixture(scope="module")
-def deformed() -> tuple[PairContactDetector, np.ndarray, PairContactSet]:
+def deformed() -> tuple[PairContactDetector, np.ndarray, ContactSet]:
     """Place a small, rotated box in the top of a larger one, both with perturbed nodes. The contacts are all points of
     the small box near the surface of the larger one, inside or outside."""
     random = np.random.default_rng(1)
@@ -65,7 +68,7 @@ def deformed() -> tuple[PairContactDetector, np.ndarray, PairContactSet]:
     positions += random.uniform(-0.02, 0.02, positions.shape)
     gaps = detector.gaps(0, 1, positions)
     near = np.flatnonzero(np.isfinite(gaps))
-    contacts = detector.contact_set(np.column_stack([np.tile([0, 1], (len(near), 1)), near]), positions)
+    contacts = detector.contact_set(detector.numbers(0, near, 1), positions)
     return detector, positions, contacts
 
 
@@ -74,15 +77,16 @@ def test_gaps_and_frames_over_a_large_box_are_those_of_a_plane() -> None:
     detector = PairContactDetector([small, large], device="cpu")
     positions = place((small, np.array([0.05, -0.1, LARGE[2] - 0.004])), (large, np.zeros(3)))
     plane = Plane(FLOOR.normal, -LARGE[2])
-    keys = detector.select(positions)
+    numbers = detector.select(positions, *NOTHING)
+    keys = detector.keys(numbers)
     assert set(map(tuple, keys[:, :2])) == {(0, 1), (1, 0)}
-    contacts = detector.contact_set(keys[keys[:, 0] == 0], positions)
+    contacts = detector.contact_set(numbers[keys[:, 0] == 0], positions)
     heights = plane.heights(points_of(small, positions[: len(small.geometry.mesh.nodes)]))
     assert contacts.count >= 4
-    assert np.allclose(contacts.gaps, heights[contacts.keys[:, 2]], atol=1e-6)
+    assert np.allclose(contacts.gaps, heights[keys[keys[:, 0] == 0, 2]], atol=1e-6)
     assert np.allclose(contacts.axes, [plane.normal, *plane.tangents()], atol=1e-5)
-    other = detector.contact_set(keys[keys[:, 0] == 1], positions)
-    places = points_of(large, positions[len(small.geometry.mesh.nodes) :])[other.keys[:, 2]]
+    other = detector.contact_set(numbers[keys[:, 0] == 1], positions)
+    places = points_of(large, positions[len(small.geometry.mesh.nodes) :])[keys[keys[:, 0] == 1, 2]]
     under = np.all(np.abs(places[:, :2] - [0.05, -0.1]) < SMALL[0] / 2 - 0.02, axis=1)
     assert under.sum() >= 4
     assert np.allclose(other.axes[under, 0], -plane.normal, atol=1e-5)
@@ -90,19 +94,19 @@ def test_gaps_and_frames_over_a_large_box_are_those_of_a_plane() -> None:
 
 
 def test_rows_are_the_derivative_of_the_gap_at_the_surface(
-    deformed: tuple[PairContactDetector, np.ndarray, PairContactSet],
+    deformed: tuple[PairContactDetector, np.ndarray, ContactSet],
 ) -> None:
     detector, positions, contacts = deformed
     small = detector.bodies[0]
     count = len(small.geometry.mesh.nodes)
     # The point that is closest to the surface is moved onto it, with its body.
     chosen = int(np.argmin(np.abs(contacts.gaps)))
-    point = int(contacts.keys[chosen, 2])
+    point = int(detector.keys(contacts.points)[chosen, 2])
     for _ in range(8):
-        record = detector.contact_set(contacts.keys[[chosen]], positions)
+        record = detector.contact_set(contacts.points[[chosen]], positions)
         positions = positions.copy()
         positions[:count] -= record.gaps[0] * record.axes[0, 0]
-    record, step = detector.contact_set(contacts.keys[[chosen]], positions), 1e-6
+    record, step = detector.contact_set(contacts.points[[chosen]], positions), 1e-6
     assert abs(record.gaps[0]) < 1e-9
     row = record.jacobian[[0]].toarray().ravel()
     measured = np.zeros_like(row)
@@ -116,7 +120,7 @@ def test_rows_are_the_derivative_of_the_gap_at_the_surface(
 
 
 def test_forces_and_torques_of_a_pair_cancel_at_any_gap(
-    deformed: tuple[PairContactDetector, np.ndarray, PairContactSet],
+    deformed: tuple[PairContactDetector, np.ndarray, ContactSet],
 ) -> None:
     _, positions, contacts = deformed
     assert contacts.gaps.min() < -0.05 and contacts.gaps.max() > 0.005
@@ -130,14 +134,14 @@ def test_forces_and_torques_of_a_pair_cancel_at_any_gap(
 
 
 def test_a_common_rigid_motion_changes_no_gap(
-    deformed: tuple[PairContactDetector, np.ndarray, PairContactSet],
+    deformed: tuple[PairContactDetector, np.ndarray, ContactSet],
 ) -> None:
     detector, positions, contacts = deformed
     rotation = Rotation.from_rotvec([0.7, -1.1, 0.4])
-    moved = detector.contact_set(contacts.keys, rotation.apply(positions) + [3.0, -2.0, 5.0])
+    moved = detector.contact_set(contacts.points, rotation.apply(positions) + [3.0, -2.0, 5.0])
     # The boxes do not rotate, so points near their edges have a tetrahedron in only one of the two.
     both = np.isfinite(moved.gaps) & np.isfinite(contacts.gaps) & (contacts.gaps < NEAR)
-    same = both & (moved.nodes == contacts.nodes).all(axis=(1, 2))
+    same = both & (moved.nodes == contacts.nodes).all(axis=1)
     assert same.sum() > 15 and np.array_equal(same, both)
     assert np.allclose(moved.gaps[same], contacts.gaps[same], atol=1e-12)
     assert np.allclose(moved.axes[same, 0], rotation.apply(contacts.axes[same, 0]), atol=1e-9)
@@ -153,19 +157,20 @@ def test_selection_is_sorted_stable_and_empty_without_overlap() -> None:
         return place((small, shifts[0]), (large, shifts[1]), (small, shifts[2]))
 
     apart = at(top + 0.1, top + 0.5)
-    assert detector.body_pairs(apart) == [] and detector.select(apart).shape == (0, 3)
-    assert detector.contact_set(np.zeros((0, 3), int), apart).count == 0
+    assert detector.body_pairs(apart) == [] and len(detector.select(apart, *NOTHING)) == 0
+    assert detector.contact_set(np.zeros(0, int), apart).count == 0
 
     positions = at(top - 0.001, top + 0.005)
     assert detector.body_pairs(positions) == [(0, 1), (1, 0), (1, 2), (2, 1)]
-    keys = detector.select(positions)
+    numbers = detector.select(positions, *NOTHING)
+    keys = detector.keys(numbers)
+    assert np.array_equal(numbers, detector.numbers(keys[:, 0], keys[:, 2], keys[:, 1]))
     assert np.array_equal(keys, keys[np.lexsort(keys.T[::-1])])
     cells = [(a, b, detector.bodies[a].selector.cell_from_point[point]) for a, b, point in keys]
     assert len(set(cells)) == len(cells)
 
     # Loaded contacts stay up to twice the activation distance; without load they are replaced or dropped.
-    contacts = detector.contact_set(keys, positions)
     lifted = at(top + 1.5 * NEAR, top + 2.5 * NEAR)
-    stays = detector.select(lifted, contacts, np.ones(contacts.count, bool))
-    assert np.array_equal(stays, keys[(keys[:, :2] < 2).all(axis=1)])
-    assert len(detector.select(lifted)) == 0
+    stays = detector.select(lifted, numbers, np.ones(len(numbers), bool))
+    assert np.array_equal(stays, numbers[(keys[:, :2] < 2).all(axis=1)])
+    assert len(detector.select(lifted, *NOTHING)) == 0

@@ -40,7 +40,8 @@ def box(size: tuple[float, float, float], plane: Plane, *, soft: bool = False) -
     embedding = embed_points(body.mesh, surface_grid(size), device="cpu")
     geometry = ContactGeometry(body.mesh, (plane,), 0.5, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
     selector = ContactSelector(geometry, activation_distance=0.01 * size[2], hysteresis=1e-3 * size[2], device="cpu")
-    return body, PairBody(geometry, selector, level_set_of_surface(shape.nodes, shape.boundary_faces(), cells=64))
+    level_set = level_set_of_surface(shape.nodes, shape.boundary_faces(), cells=64)
+    return body, PairBody(geometry, selector, level_set, body.mesh.nodes)
 
 
 def world(

@@ -15,7 +15,8 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.meshing.cage_file import read_cage_in, read_cage_mesh
-from egs_warp.pipelines.creature import CreatureOptions, make_creature, place_cage
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
+from egs_warp.pipelines.placed_cage import place_cage
 from tests.support.meshes import box_mesh
 
 _UPRIGHT = BodyFrame(np.eye(3), np.zeros(3), 1.0)

@@ -24,7 +24,7 @@ from egs_warp.meshing.level_set import (
     thin_parts,
 )
 from egs_warp.meshing.occupancy import LatticeSolid, solid_from_gaussians
-from egs_warp.pipelines.creature import place_cage
+from egs_warp.pipelines.placed_cage import place_cage
 from tests.support.meshes import box_mesh
 
 

@@ -12,8 +12,9 @@ from egs_warp.errors import ArgumentError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.pipelines.creature import CreatureOptions, PlacedCage, choose_front, make_creature, place_cage
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.facing_direction import Front, _lean, mean_view
+from egs_warp.pipelines.placed_cage import PlacedCage, choose_front, place_cage
 from tests.support.frames import Lying
 from tests.support.meshes import carved
 

@@ -17,7 +17,7 @@ import pytest
 import egs_warp as egs
 from egs_warp.assets import pawn
 from egs_warp.motions.sequence import Stance
-from egs_warp.pipelines.creature import PlacedCage, estimated_up
+from egs_warp.pipelines.placed_cage import PlacedCage, estimated_up
 from tests.support.ply_variants import columns_of, ply_of
 
 

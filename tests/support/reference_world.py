@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.detection import ContactDetector
 from egs_warp.contact.newton import DELASSUS_REGULARIZATION
-from egs_warp.contact.pair_contact import PairBody, PairContactDetector, PairContactSet
+from egs_warp.contact.pair_contact import PairBody, PairContactDetector
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.step_problem import StepProblem
@@ -36,7 +37,7 @@ class ReferenceWorld:
     friction: float
     residual: float = np.inf
     """N s, norm of the residual of the last step."""
-    pairs: PairContactSet | None = None
+    pairs: ContactSet | None = None
     forces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     """(n, 3) N, forces of ``pairs``."""
 
@@ -54,8 +55,9 @@ class ReferenceWorld:
         problems = [StepProblem(body, state, dt) for body, state in zip(self.bodies, self.states, strict=True)]
         ends = [problem.end_positions(problem.state.velocities + dt * problem.body.gravity) for problem in problems]
         loaded = self.forces[:, 0] > 0.0
-        keys = self.detector.select(np.concatenate(ends), self.pairs, loaded)
-        self.pairs = self.detector.contact_set(keys, np.concatenate([state.positions for state in self.states]))
+        previous = np.zeros(0, int) if self.pairs is None else self.pairs.points
+        numbers = self.detector.select(np.concatenate(ends), previous, loaded)
+        self.pairs = self.detector.contact_set(numbers, np.concatenate([state.positions for state in self.states]))
         rows, gaps = [self.pairs.jacobian.toarray()], [self.pairs.gaps]
         for i, (ground, state, end) in enumerate(zip(self.grounds, self.states, ends, strict=True)):
             selected = self.contact[i].selector.select(np.zeros(0, int), np.zeros(0, bool), ground.gaps(end)[0])

@@ -1,5 +1,8 @@
 """Kernels for the contacts of all worlds: their record, and the products W^T, W v and W^T f with the contact Jacobian W
 (Eq. 8).
+
+A contact with the ground has one side, a tetrahedron with four nodes. A contact between two bodies has two sides, and
+the weights of the second one are negative. Arrays of K contacts with S sides have K S entries of nodes and weights.
 """
 
 import warp as wp
@@ -79,11 +82,15 @@ def contact_jacobian_kernel(
     """
     world, k = wp.tid()
     if k < counts[world]:
-        for corner in range(4):
-            node = nodes[world, k][corner]
-            for axis in range(3):
-                for i in range(3):
-                    rows_out[world, 3 * node + i, 3 * k + axis] = weights[world, k][corner] * axes[world, k][axis, i]
+        sides = nodes.shape[1] // axes.shape[1]
+        for side in range(sides * k, sides * (k + 1)):
+            for corner in range(4):
+                node = nodes[world, side][corner]
+                share = weights[world, side][corner]
+                if share != real(0.0):
+                    for axis in range(3):
+                        for i in range(3):
+                            rows_out[world, 3 * node + i, 3 * k + axis] = share * axes[world, k][axis, i]
 
 
 @wp.kernel
@@ -102,14 +109,16 @@ def contact_velocities_kernel(
     world, k, column = wp.tid()
     speeds = Vec3()
     if k < counts[world]:
-        corners = nodes[world, k]
-        shares = weights[world, k]
         frame = axes[world, k]
-        for corner in range(4):
-            for i in range(3):
-                velocity = velocities[world, 3 * corners[corner] + i, column]
-                for axis in range(3):
-                    speeds[axis] += (shares[corner] * frame[axis, i]) * velocity
+        sides = nodes.shape[1] // axes.shape[1]
+        for side in range(sides * k, sides * (k + 1)):
+            corners = nodes[world, side]
+            shares = weights[world, side]
+            for corner in range(4):
+                for i in range(3):
+                    velocity = velocities[world, 3 * corners[corner] + i, column]
+                    for axis in range(3):
+                        speeds[axis] += (shares[corner] * frame[axis, i]) * velocity
     for axis in range(3):
         speeds_out[world, 3 * k + axis, column] = speeds[axis]
 
@@ -127,12 +136,14 @@ def nodal_force(
     """Return the nodal force W^T f at ``node``, summed over the contacts in their order."""
     total = Vec3()
     for k in range(counts[world]):
-        for corner in range(4):
-            if nodes[world, k][corner] == node:
-                for axis in range(3):
-                    for i in range(3):
-                        entry = weights[world, k][corner] * axes[world, k][axis, i]
-                        total[i] += entry * forces[world, k][axis]
+        sides = nodes.shape[1] // axes.shape[1]
+        for side in range(sides * k, sides * (k + 1)):
+            for corner in range(4):
+                if nodes[world, side][corner] == node:
+                    for axis in range(3):
+                        for i in range(3):
+                            entry = weights[world, side][corner] * axes[world, k][axis, i]
+                            total[i] += entry * forces[world, k][axis]
     return total
 
 

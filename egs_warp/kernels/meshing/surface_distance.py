@@ -1,4 +1,4 @@
-"""Signed distance of points from a closed triangle mesh."""
+"""Distance of points from a closed triangle mesh, with and without sign."""
 
 import warp as wp
 
@@ -24,4 +24,25 @@ def surface_distance_kernel(
     if query.result:
         nearest = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
         distance = query.sign * wp.length(points[i] - nearest)
+    distances_out[i] = distance
+
+
+@wp.kernel
+def unsigned_distance_kernel(
+    first_row: wp.int32,
+    # Model:
+    mesh: wp.uint64,
+    # In:
+    points: wp.array[wp.vec3],
+    max_distance: float,
+    # Out:
+    distances_out: wp.array[float],
+):
+    """Compute the distance of each point from ``mesh``, ``max_distance`` where no triangle is nearer than that."""
+    i = first_row + wp.tid()
+    query = wp.mesh_query_point_no_sign(mesh, points[i], max_distance)
+    distance = max_distance
+    if query.result:
+        nearest = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
+        distance = wp.length(points[i] - nearest)
     distances_out[i] = distance

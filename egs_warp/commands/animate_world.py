@@ -1,0 +1,80 @@
+"""``egs-warp animate WORLD.yaml``: simulate and film the bodies of a world file."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from egs_warp.commands.camera_flags import shot_of
+from egs_warp.commands.flags import parse_direction
+from egs_warp.commands.scene_flags import print_above_bars, print_note, start_device
+from egs_warp.errors import UserError
+
+WORLD_ENDINGS = (".yaml", ".yml")
+"""Endings of the names of world files."""
+_FLAGS = (
+    *("capture", "out", "overwrite", "device", "camera", "size", "fps", "background", "view_from", "no_shadow"),
+    *("frames", "no_get_up", "style", "preview"),
+)
+"""Flags that also apply to a world."""
+
+
+def is_world(capture: str) -> bool:
+    """Return True if ``capture`` names a world file."""
+    return Path(capture).suffix.lower() in WORLD_ENDINGS
+
+
+def animate_world(args: argparse.Namespace) -> bool:
+    """Run ``egs-warp animate`` for a world file, with the output folder already checked; return True if a body did not
+    do what was requested."""
+    from egs_warp.io.run_folder import run_folder
+    from egs_warp.io.video import ffmpeg_program
+    from egs_warp.motions.style import read_style
+    from egs_warp.pipelines.animate import PREVIEW_SIZE
+    from egs_warp.pipelines.animate_world import COMMAND, write_world
+    from egs_warp.pipelines.progress import simulation_bar
+    from egs_warp.pipelines.simulated_run import check_frames
+    from egs_warp.pipelines.world_file import read_world
+    from egs_warp.pipelines.world_run import simulate_world
+
+    for action in args.parser._actions:
+        if action.dest in vars(args) and action.dest not in _FLAGS and getattr(args, action.dest) != action.default:
+            flag = action.option_strings[0] if action.option_strings else action.dest
+            raise UserError(f"{flag}: is for a single capture; a world file describes its bodies; leave it out")
+    shot, background = shot_of(args)
+    if background is not None:
+        raise UserError("--background: a world has a colour or transparent as its background; give one of these")
+    check_frames(args.frames)
+    style = read_style(args.style) if args.style is not None else None
+    view_from = None if args.view_from is None else parse_direction("view-from", args.view_from)
+    ffmpeg_program()
+    start_device(args.device)
+    with run_folder(args.out, command=COMMAND, overwrite=args.overwrite) as folder:
+        scripted = read_world(args.capture, device=args.device, progress=lambda name: print_note(f"preparing {name}"))
+        for note in scripted.notes:
+            print_note(note)
+        with simulation_bar() as show_frames:
+            run = simulate_world(
+                scripted.world,
+                scripted.motions,
+                frames=args.frames,
+                style=style,
+                pushes=scripted.pushes,
+                get_up=not args.no_get_up,
+                progress=show_frames,
+            )
+        report = write_world(
+            run,
+            folder,
+            shot=shot,
+            size=PREVIEW_SIZE if args.preview else 512,
+            view_from=view_from,
+            shadow=not args.no_shadow,
+            notes=scripted.notes,
+            asked=scripted.text,
+            show_note=print_note,
+        )
+        folder.finish()
+    print_above_bars(report.summary())
+    print_above_bars(f"film: {args.out / str(report.film)} (sheet.png and report.json are beside it)")
+    return report.state.is_failure

@@ -1,0 +1,152 @@
+"""Contacts of an island: each body with the ground, and the bodies with each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.coupled_step import CoupledSolver
+from egs_warp.contact.detection import ContactDetector
+from egs_warp.contact.newton import NewtonIterate
+from egs_warp.contact.pair_contact import PairContactDetector
+from egs_warp.contact.selection import ACTIVATION_DEPTH
+
+_MIN_RATIO = 1e-6
+"""Lower bound of Coulomb coefficients in their ratios, because a tangent of length 0 has no velocity."""
+
+
+@dataclass(frozen=True)
+class IslandContacts:
+    """Detection and selection of the contacts of an island. Contacts are identified by the numbers of
+    ``PairContactDetector``; all arrays have the concatenated nodes of the bodies.
+
+    Coulomb's law of the island has one coefficient, the largest. A contact with another coefficient has shorter
+    tangents: with the ratio s of the coefficients, tangents s t have velocities s u_t and forces f_t / s, so that the
+    cone |f_t / s| <= mu f_n is the cone of the coefficient s mu.
+    """
+
+    grounds: tuple[ContactDetector, ...]
+    """Contact of each body with the ground."""
+    pairs: PairContactDetector
+    """Contact between the bodies."""
+    frictions: np.ndarray
+    """(k, k + 1) Coulomb coefficients of the contacts of each body with each other body, and in the last column with
+    the ground."""
+
+    @property
+    def friction(self) -> float:
+        """The largest Coulomb coefficient."""
+        return float(self.frictions.max())
+
+    def tangent_lengths(self, keys: np.ndarray) -> np.ndarray:
+        """Return (n, 3), the lengths of the axes of the contacts with the ``keys`` (n, 3) of ``PairContactDetector``: 1
+        for the normal, and the ratio of the Coulomb coefficients for the tangents."""
+        ratios = np.maximum(self.frictions[keys[:, 0], keys[:, 1]], _MIN_RATIO) / max(self.friction, _MIN_RATIO)
+        return np.column_stack([np.ones(len(keys)), ratios, ratios])
+
+    def select(self, previous: np.ndarray, loaded: np.ndarray, end_positions: np.ndarray) -> np.ndarray:
+        """Select the contacts of a step.
+
+        Args:
+            previous: (m,) numbers of the contacts of the previous step.
+            loaded: (m,) bool, True for those that carried load.
+            end_positions: (N, 3) m, at the predicted end of the step.
+
+        Returns:
+            (n,) numbers, those of contacts with the ground first.
+        """
+        keys, selected = self.pairs.keys(previous), []
+        for body, (ground, positions) in enumerate(self._by_body(end_positions)):
+            own = (keys[:, 0] == body) & (keys[:, 1] < 0)
+            points = self.pairs.bodies[body].selector.select(keys[own, 2], loaded[own], ground.gaps(positions)[0])
+            selected.append(self.pairs.numbers(body, points, -1))
+        return np.concatenate([*selected, self.pairs.select(end_positions, previous, loaded)])
+
+    def contact_set(self, numbers: np.ndarray, positions: np.ndarray) -> ContactSet:
+        """Return the contacts with the ``numbers`` (n,), for nodal ``positions`` (N, 3) m at the start of the step."""
+        keys = self.pairs.keys(numbers)
+        between = np.flatnonzero(keys[:, 1] >= 0)
+        order, sets = [between], [self.pairs.contact_set(numbers[between], positions)]
+        for body, (ground, own_positions) in enumerate(self._by_body(positions)):
+            own = np.flatnonzero((keys[:, 0] == body) & (keys[:, 1] < 0))
+            order.append(own)
+            sets.append(self._as_two_sided(body, ground.contact_set(keys[own, 2], own_positions)))
+        joined = sets[0]
+        for other in sets[1:]:
+            joined = joined.concatenate(other)
+        back = np.argsort(np.concatenate(order))
+        arrays = {name: values[back] for name, values in joined.batched_fields()}
+        arrays["axes"] = arrays["axes"] * self.tangent_lengths(keys)[:, :, None]
+        return replace(joined, **arrays)
+
+    def _as_two_sided(self, body: int, contacts: ContactSet) -> ContactSet:
+        """Return the contacts of a body with the ground in the numbering of the island."""
+        start = int(self.pairs.node_starts[body])
+        nodes = (contacts.nodes + start).astype(np.int32)
+        return replace(
+            contacts,
+            points=self.pairs.numbers(body, contacts.points, -1),
+            nodes=np.hstack([nodes, nodes]),
+            weights=np.hstack([contacts.weights, np.zeros_like(contacts.weights)]),
+            node_count=int(self.pairs.node_starts[-1]),
+        )
+
+    def find_penetrating(
+        self, contacts: np.ndarray, start: np.ndarray, end: np.ndarray, tolerance: float
+    ) -> np.ndarray:
+        """Return the numbers (k,) of points that would be too deep at the end of a step and are not contacts; see
+        ``ContactSelector``.
+
+        Args:
+            contacts: (n,) numbers of the contacts of the step.
+            start: (N, 3) m, at the start of the step.
+            end: (N, 3) m, at the end of the step.
+            tolerance: penetration tolerance, m.
+        """
+        keys, found = self.pairs.keys(contacts), []
+        for body, ((ground, before), (_, after)) in enumerate(
+            zip(self._by_body(start), self._by_body(end), strict=True)
+        ):
+            gaps = ground.gaps(after)[0]
+            if gaps.min() < -ACTIVATION_DEPTH * tolerance:
+                own = keys[(keys[:, 0] == body) & (keys[:, 1] < 0), 2]
+                selector, start_gaps = self.pairs.bodies[body].selector, ground.gaps(before)[0]
+                points = selector.find_penetrating(own, gaps, start_gaps, tolerance)
+                found.append(self.pairs.numbers(body, points, -1))
+        return np.concatenate([*found, self.pairs.find_penetrating(contacts, start, end, tolerance)])
+
+    def min_gaps(self, positions: np.ndarray) -> np.ndarray:
+        """Return (k,) m, the minimum gap of each body to the ground and to the other bodies."""
+        least = np.array([ground.gaps(part)[0].min() for ground, part in self._by_body(positions)])
+        for a, b in self.pairs.body_pairs(positions):
+            gap = self.pairs.gaps(a, b, positions).min()
+            least[[a, b]] = np.minimum(least[[a, b]], gap)
+        return least
+
+    def _by_body(self, positions: np.ndarray) -> Sequence[tuple[ContactDetector, np.ndarray]]:
+        """Return the ground contact and the positions of each body."""
+        return list(zip(self.grounds, np.split(positions, self.pairs.node_starts[1:-1]), strict=True))
+
+
+@dataclass(frozen=True)
+class IslandSolver(CoupledSolver):
+    """Newton's method on velocities and contact forces of an island. ``detector`` and ``points`` are those of its first
+    body and are not used."""
+
+    contacts: IslandContacts = field(kw_only=True)
+    """Contacts of the island."""
+
+    @property
+    def friction(self) -> float:
+        """Coulomb coefficient."""
+        return self.contacts.friction
+
+    def with_penetrating_points(self, end: NewtonIterate) -> ContactSet | None:
+        """Return the contacts of ``end``, extended by the points that are too deep at ``end``; None if no point is."""
+        problem, contacts = end.linearization.tangent.problem, end.linearization.contacts
+        start, tolerance = problem.state.positions, self.penetration_tolerance
+        added = self.contacts.find_penetrating(contacts.points, start, problem.end_positions(end.velocities), tolerance)
+        return None if len(added) == 0 else contacts.concatenate(self.contacts.contact_set(added, start))

@@ -1,0 +1,101 @@
+"""Newton iterates of the step of an island: several bodies with contact between them (Eq. 4, 8).
+
+``island_problem`` contains the equations and the block-diagonal tangent. Contact velocities and Coulomb's law are those
+of one body, for contacts with one or two sides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.newton import ContactLinearization, HostNewtonStep
+from egs_warp.fem.island_problem import IslandTangent, Tensions
+
+
+@dataclass(frozen=True)
+class IslandLinearization(ContactLinearization):
+    """``ContactLinearization`` of an island."""
+
+    tangent: IslandTangent
+
+    def iterate_at(self, tension: Tensions, velocities: np.ndarray, forces: np.ndarray) -> IslandNewtonIterate:
+        """Return the Newton iterate at ``velocities`` (N, 3) and contact ``forces`` (n, 3)."""
+        return IslandNewtonIterate.at(self, tension, velocities, forces)
+
+
+@dataclass(frozen=True, eq=False)
+class IslandNewtonIterate(HostNewtonStep):
+    """``NewtonIterate`` of an island, evaluated with NumPy."""
+
+    linearization: IslandLinearization
+    tensions: Tensions
+    velocities: np.ndarray
+    forces: np.ndarray
+    free_residual: np.ndarray
+    """(N, 3) N s, residual without contact forces."""
+    residual_norm: float
+    penetration: None = None
+
+    @classmethod
+    def at(cls, response: IslandLinearization, tensions: Tensions, velocities: np.ndarray, forces: np.ndarray) -> Self:
+        """Evaluate the iterate at ``velocities`` (N, 3) and ``forces`` (n, 3)."""
+        problem, contacts = response.tangent.problem, response.contacts
+        free = problem.residual(velocities, tensions)
+        # For one column, the sparse product is faster than a kernel launch.
+        pushes = (contacts.jacobian_columns @ forces.ravel()).reshape(-1, 3)
+        norm = problem.relative_norm(free - problem.dt * pushes)
+        return cls(response, tensions, velocities, forces, free, norm)
+
+    @property
+    def is_inversion_free(self) -> bool:
+        """True if no element is inverted."""
+        return bool(np.isfinite(self.residual_norm))
+
+    @cached_property
+    def _free_velocities(self) -> np.ndarray:
+        """(3N,) m/s, after a Newton step without contact forces."""
+        return self.velocities.ravel() - self.linearization.tangent.solve(self.free_residual.ravel())
+
+    @cached_property
+    def free_contact_velocities(self) -> np.ndarray:
+        """(3n,) m/s, contact velocities after a Newton step without contact forces."""
+        return self.linearization.contacts.jacobian @ self._free_velocities
+
+    def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
+        end = (self._free_velocities + self.linearization.columns @ forces.ravel()).reshape(-1, 3)
+        velocities = self.velocities + length * (end - self.velocities)
+        return self.at(self.linearization, self.tensions, velocities, self.forces + length * (forces - self.forces))
+
+    def with_new_tangent(self) -> Self:
+        """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""
+        old = self.linearization.tangent
+        tangent: Any = old.problem.tangent(old.factors, self.velocities, self.tensions)
+        return replace(self, linearization=IslandLinearization.of(tangent, self.linearization.contacts))
+
+
+class IslandLinearizer:
+    """Builder of the contact linearisations of an island (see ``ContactLinearizer``)."""
+
+    def __call__(self, tangent: Any, contacts: ContactSet) -> IslandLinearization:
+        """Linearise ``contacts`` with ``tangent``, an ``IslandTangent``."""
+        return IslandLinearization.of(tangent, contacts)
+
+    def predict_velocities(
+        self,
+        tangent: IslandTangent,
+        contacts: ContactSet,
+        tensions: Tensions,
+        velocities: np.ndarray,
+        forces: np.ndarray,
+    ) -> np.ndarray | None:
+        """Take one Newton step with fixed contact forces; see ``ContactLinearizer.predict_velocities``."""
+        problem = tangent.problem
+        residual = problem.residual(velocities, tensions) - problem.dt * contacts.nodal_forces(forces)
+        end = velocities - tangent.solve(residual.ravel()).reshape(velocities.shape)
+        return end if problem.is_inversion_free(end) else None

@@ -1,0 +1,55 @@
+"""Deformation of the Gaussians of several bodies into one cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+
+from egs_warp.deformation.deformer import DeformedGaussians, Deformer
+from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud, concatenate, with_degree
+from egs_warp.launching import empty
+
+
+class JointDeformer:
+    """Deformer of the clouds of several bodies, each with its own cage, into one cloud. Colour bands that only some of
+    the clouds have are zero for the others."""
+
+    def __init__(self, deformers: Sequence[Deformer]) -> None:
+        self._deformers = tuple(deformers)
+        degree = max(deformer.rest.sh_degree for deformer in deformers)
+        self.rest = concatenate(*(_with_bands(deformer.rest, degree) for deformer in deformers))
+        """All Gaussians, each in the frame of its own cage."""
+        rest = self.rest
+        self._deformed = DeformedGaussians(
+            replace(rest, **{name: wp.clone(getattr(rest, name)) for name in ARRAYS if name != "opacity_logits"}),
+            rotations=empty(rest.count, wp.vec4, rest.device),
+        )
+
+    def deform(self, poses: Sequence[np.ndarray]) -> DeformedGaussians:
+        """Deform all bodies; ``poses`` are the node positions (N, 3) m of each. The next call overwrites the result."""
+        deformed, first = self._deformed, 0
+        for deformer, positions in zip(self._deformers, poses, strict=True):
+            part = deformer.deform(positions)
+            for name in ("means", "rotations", "log_scales", "sh"):
+                _copy_rows(getattr(deformed.cloud, name), getattr(part.cloud, name), first)
+            _copy_rows(deformed.rotations, part.rotations, first)
+            first += part.cloud.count
+        return deformed
+
+
+def _copy_rows(target: wp.array, source: wp.array, first: int) -> None:
+    """Copy the rows of ``source`` into ``target``, beginning at the row ``first``."""
+    rows = target[first : first + source.shape[0]]
+    wp.copy(rows if rows.ndim == 1 else rows[:, : source.shape[1]], source)
+
+
+def _with_bands(cloud: GaussianCloud, degree: int) -> GaussianCloud:
+    """Return ``cloud`` with the colour bands up to ``degree``, added ones zero."""
+    sh = with_degree(cloud, degree).sh.numpy()
+    missing = (degree + 1) ** 2 - sh.shape[1]
+    if missing == 0:
+        return cloud
+    return replace(cloud, sh=wp.array(np.pad(sh, ((0, 0), (0, missing), (0, 0))), dtype=wp.vec3, device=cloud.device))

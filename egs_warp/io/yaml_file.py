@@ -1,0 +1,110 @@
+"""Reading of YAML files written by users: safe loading without aliases, and validation by a JSON schema whose errors
+name the line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from egs_warp.errors import UserError, did_you_mean
+from egs_warp.io.text import read_text
+
+
+def read_yaml(path: Path) -> tuple[Any, Any]:
+    """Return the values of a YAML file and its tree of nodes, from which ``line_of`` finds lines.
+
+    Raises ``UserError`` if the file cannot be read or is not YAML, and for aliases and for keys that occur twice.
+    """
+    import yaml
+
+    class Plain(yaml.SafeLoader):
+        """YAML loader without aliases, because a few lines of nested aliases can expand beyond the available memory."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                where = self.peek_event().start_mark
+                raise yaml.MarkedYAMLError(problem="an alias, *name; write out what it stands for", problem_mark=where)
+            return super().compose_node(parent, index)
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            keys: set[str] = set()
+            for key, _ in node.value:
+                if str(key.value) in keys:
+                    problem = f"the key {str(key.value)[:80]!r} occurs twice; remove one"
+                    raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
+                keys.add(str(key.value))
+            return super().construct_mapping(node, deep)
+
+    try:
+        loader = Plain(read_text(path))
+        try:
+            node = loader.get_single_node()
+            return None if node is None else loader.construct_document(node), node
+        finally:
+            loader.dispose()
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); correct it") from error
+
+
+def check_schema(path: Path, values: Any, node: Any, schema: str) -> None:
+    """Raise ``UserError`` for the first error of the ``values`` of a YAML file against a schema of the package
+    ``egs_warp.io``. The message names the line, the entry and the mistake."""
+    errors = sorted(_validator(schema).iter_errors(values), key=lambda error: line_of(node, list(error.absolute_path)))
+    if not errors:
+        return
+    error = errors[0]
+    # Alternatives fail together; the deepest error is the one to correct.
+    while error.context:
+        error = max(error.context, key=lambda each: len(each.absolute_path))
+    place = list(error.absolute_path)
+    message = _mistake(error)
+    if error.validator == "additionalProperties":
+        unknown = next(key for key in error.instance if key not in error.schema.get("properties", {}))
+        place.append(unknown)
+    where = ".".join(str(part + 1) if isinstance(part, int) else str(part) for part in place)
+    entry = f"{where}: " if where else ""
+    raise UserError(f"{path}, line {line_of(node, place)}: {entry}{message}")
+
+
+def line_of(node: Any, place: Sequence[str | int]) -> int:
+    """Return the line, from 1, of the entry at ``place``, the keys and indices that lead to it."""
+    mark = None if node is None else node.start_mark
+    for part in place:
+        if node is None or not isinstance(node.value, list):
+            break
+        if isinstance(part, int):
+            node = node.value[part]
+            mark = node.start_mark
+            continue
+        key, node = next(((key, value) for key, value in node.value if str(key.value) == str(part)), (None, None))
+        mark = mark if key is None else key.start_mark
+    return 1 if mark is None else mark.line + 1
+
+
+def _mistake(error: Any) -> str:
+    """Return the text of a schema error: what is wrong and what to do."""
+    rule, value = error.validator, str(error.instance)
+    value = value if len(value) <= 80 else f"{value[:77]}..."
+    known: Mapping[str, Any] = error.schema.get("properties", {})
+    advice = error.schema.get("description", "")
+    if rule == "additionalProperties":
+        unknown = next(key for key in error.instance if key not in known)
+        return f"unknown key{did_you_mean(unknown, known)}; give one of {', '.join(known)}"
+    if rule == "required":
+        missing = next(key for key in error.validator_value if key not in error.instance)
+        return f"{missing} is missing; {known[missing].get('description', 'give it')}"
+    return f"{value!r} is not valid; {advice or error.message[:200]}"
+
+
+@cache
+def _validator(schema: str) -> Any:
+    # Imported here because the import is slow.
+    from jsonschema import Draft202012Validator
+
+    return Draft202012Validator(json.loads(resources.files("egs_warp.io").joinpath(schema).read_text("utf-8")))

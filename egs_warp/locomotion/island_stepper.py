@@ -1,0 +1,367 @@
+"""The step of an island: bodies that may touch each other in the step, planned one by one and solved together.
+
+Each creature plans its own activations in a QP whose contact forces are those of the whole island, so the other bodies
+yield to it as they would in the solve. A creature that is planned later knows the activations of the earlier ones
+(Gauss-Seidel); for an earlier one, the later ones keep the activations of the previous step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.coupled_step import CoupledResult
+from egs_warp.contact.island_contacts import IslandContacts, IslandSolver
+from egs_warp.contact.island_newton import IslandLinearizer
+from egs_warp.contact.newton import ContactLinearization
+from egs_warp.contact.pair_contact import PairContactDetector
+from egs_warp.fem.body import BodyState
+from egs_warp.fem.island_problem import IslandProblem
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.locomotion.linear_step import PredictedStep
+from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.planner import Plan, StageClock
+from egs_warp.locomotion.prediction import predict_end
+from egs_warp.locomotion.step_cost import objectives_value
+from egs_warp.locomotion.stepper import (
+    MAX_HALVINGS,
+    REPLAN_FACTOR,
+    REPLAN_MARGIN,
+    LocomotionStepper,
+    StepReport,
+    WarmStart,
+)
+from egs_warp.muscles.tension import MuscleEnergy
+
+MAX_PAIR_DEPTH = 0.01
+"""Depth of one body in another, in body heights, beyond which a step that has increased it is repeated as half steps.
+The planes of contact are those at the start of the step, which is inaccurate where a body moves far over an edge.
+"""
+
+States: TypeAlias = Sequence[BodyState]
+Memories: TypeAlias = Sequence[WarmStart]
+Objectives: TypeAlias = Sequence[Sequence[AnyObjective]]
+
+
+@dataclass(frozen=True)
+class IslandInputs:
+    """Inputs of a step of an island that are known before its activations are planned."""
+
+    problem: IslandProblem
+    contacts: ContactSet
+    normal_bias: np.ndarray
+    """(n,) m/s, velocity bias of each contact in the normal direction."""
+    friction: float
+    forces: np.ndarray
+    """(n, 3) N, contact forces of the previous step; zero for contacts that are new in this step."""
+
+
+class IslandStepper:
+    """Stepper of the bodies of an island."""
+
+    def __init__(
+        self,
+        members: Sequence[int],
+        steppers: Sequence[LocomotionStepper],
+        pairs: PairContactDetector,
+        frictions: np.ndarray,
+    ) -> None:
+        """Make the stepper of some bodies of a world.
+
+        Args:
+            members: indices of the bodies in the world, ascending.
+            steppers: stepper of each of the k bodies.
+            pairs: contact between them.
+            frictions: (k, k) Coulomb coefficients between them.
+        """
+        self.members, self.steppers = tuple(members), tuple(steppers)
+        with_ground = np.array([[stepper.geometry.friction] for stepper in steppers])
+        detectors = tuple(stepper.detector for stepper in steppers)
+        self.contacts = IslandContacts(detectors, pairs, np.hstack([frictions, with_ground]))
+        self.solver = IslandSolver(
+            steppers[0].detector,
+            steppers[0].selector,
+            push_out_cap=min(stepper.solver.push_out_cap for stepper in steppers),
+            penetration_tolerance=min(stepper.solver.penetration_tolerance for stepper in steppers),
+            contacts=self.contacts,
+        )
+        self._linearizer = IslandLinearizer()
+
+    @cached_property
+    def _factors(self) -> tuple[object, ...]:
+        return tuple(stepper.factors for stepper in self.steppers)
+
+    def advance(self, states: States, memories: Memories, objectives: Objectives, dt: float) -> list[list[StepReport]]:
+        """Make one step of ``dt`` s; if it does not converge, or if bodies penetrate too far, repeat it as half steps.
+        See ``WorldStepper.advance`` and ``LocomotionStepper.advance``."""
+        reports = self._step(states, memories, objectives, None, dt)
+        if reports[0].converged:
+            if not self._is_too_deep(reports, states):
+                return [[report] for report in reports]
+            return self._half_steps(states, memories, [r.activations for r in reports], dt, MAX_HALVINGS)
+        candidates = [
+            self._half_steps(states, memories, activations, dt, MAX_HALVINGS)
+            for activations in ([r.activations for r in reports], [memory.activations for memory in memories])
+        ]
+        return min(candidates, key=lambda done: self._rank(done, states, objectives))
+
+    def _half_steps(
+        self, states: States, memories: Memories, activations: Sequence[np.ndarray], dt: float, max_halvings: int
+    ) -> list[list[StepReport]]:
+        """Make two steps of ``dt`` / 2 s with given activations. A step that does not converge, or in which bodies
+        penetrate too far, is halved again, up to ``max_halvings`` - 1 times."""
+        done: list[list[StepReport]] = [[] for _ in self.steppers]
+        for _ in range(2):
+            ends = self._step(states, memories, [()] * len(states), activations, 0.5 * dt)
+            reports = [[end] for end in ends]
+            if max_halvings > 1 and (not ends[0].converged or self._is_too_deep(ends, states)):
+                reports = self._half_steps(states, memories, activations, 0.5 * dt, max_halvings - 1)
+            for before, after in zip(done, reports, strict=True):
+                before += after
+            states = [each[-1].state for each in done]
+            memories = [WarmStart.from_report(each[-1]) for each in done]
+        return done
+
+    def _is_too_deep(self, ends: Sequence[StepReport], states: States) -> bool:
+        """Return True if a step from ``states`` has pushed a body too deep into another or into the ground."""
+        height = min(stepper.body.height for stepper in self.steppers)
+        end, limit = np.array([report.min_gap for report in ends]), -MAX_PAIR_DEPTH * height
+        if end.min() >= limit:
+            return False
+        start = self.contacts.min_gaps(np.concatenate([state.positions for state in states]))
+        return bool(((end < limit) & (end < start)).any())
+
+    def _rank(self, done: Sequence[Sequence[StepReport]], states: States, objectives: Objectives) -> tuple[bool, float]:
+        """Return the sort key of half steps; see ``LocomotionStepper.advance``."""
+        value = 0.0
+        for stepper, reports, state, targets in zip(self.steppers, done, states, objectives, strict=True):
+            last = reports[-1]
+            problem = StepProblem(stepper.body, reports[-2].state if len(reports) > 1 else state, last.dt)
+            pushes = last.contacts.nodal_forces(last.forces)
+            value += objectives_value(
+                problem, last.contacts, targets, last.state.velocities, pushes, stepper.body.speed_unit
+            )
+        return not all(report.converged for report in done[0]), value
+
+    def _step(
+        self,
+        states: States,
+        memories: Memories,
+        objectives: Objectives,
+        activations: Sequence[np.ndarray] | None,
+        dt: float,
+    ) -> list[StepReport]:
+        """Make one step of ``dt`` s with given ``activations``, or with planned ones if they are None. Return the
+        report of each body."""
+        clock = StageClock()
+        start = self._start(states, memories, dt)
+        problem = start.problem
+        clock.lap("detect")
+        current = [memory.activations for memory in memories] if activations is None else list(activations)
+        response, velocities, forces = predict_end(self._linearizer, self._factors, start, self._tensions(current))
+        clock.lap("predict")
+        plans = [Plan(each, velocities, forces) for each in current]
+        if activations is not None:
+            result = self._solve(response, plans)
+            clock.lap("solve")
+            return self._reports(problem, plans, result, clock)
+        predicted = PredictedStep(response, start.normal_bias, np.zeros(0), velocities, forces)
+        plans = self._plan(predicted, plans, memories, objectives, clock)
+        expected = self._values(problem, response.contacts, plans[0], objectives)
+        result = self._solve(response, plans)
+        clock.lap("solve")
+        if result.converged:
+            plans, result = self._replan(problem, plans, expected, result, memories, objectives, clock)
+        return self._reports(problem, plans, result, clock)
+
+    def _start(self, states: States, memories: Memories, dt: float) -> IslandInputs:
+        """Detect the contacts of a step and collect its inputs."""
+        problem = IslandProblem(
+            tuple(
+                StepProblem(stepper.body, state, dt, stepper.settings.drag)
+                for stepper, state in zip(self.steppers, states, strict=True)
+            )
+        )
+        previous, forces = self._previous_contacts(memories)
+        numbers = self.contacts.select(previous, forces[:, 0] > 0.0, problem.ballistic_positions)
+        contacts = self.contacts.contact_set(numbers, problem.state.positions)
+        forces = contacts.transferred_forces(previous, forces)
+        forces = forces / self.contacts.tangent_lengths(self.contacts.pairs.keys(numbers))
+        bias = self.solver.normal_bias(contacts, dt)
+        return IslandInputs(problem, contacts, bias, self.contacts.friction, forces)
+
+    def _previous_contacts(self, memories: Memories) -> tuple[np.ndarray, np.ndarray]:
+        """Return the numbers (m,) and forces (m, 3) N of the contacts of the previous step."""
+        pairs, numbers, forces = self.contacts.pairs, [], []
+        for body, memory in enumerate(memories):
+            others, points = np.divmod(memory.points, pairs.point_counts[body])
+            for other in np.unique(others).tolist():
+                # A negative number is a contact of another body's point, which that body remembers.
+                if other == 0 or (other > 0 and other - 1 in self.members):
+                    chosen = others == other
+                    touched = -1 if other == 0 else self.members.index(other - 1)
+                    numbers.append(pairs.numbers(body, points[chosen], touched))
+                    forces.append(memory.forces[chosen])
+        return np.concatenate([np.zeros(0, int), *numbers]), np.concatenate([np.zeros((0, 3)), *forces])
+
+    def _tensions(self, activations: Sequence[np.ndarray]) -> list[MuscleEnergy | None]:
+        return [
+            MuscleEnergy.of(stepper.muscles, each) if len(each) else None
+            for stepper, each in zip(self.steppers, activations, strict=True)
+        ]
+
+    def _plan(
+        self,
+        predicted: PredictedStep,
+        plans: Sequence[Plan],
+        memories: Memories,
+        objectives: Objectives,
+        clock: StageClock,
+        bodies: Sequence[int] | None = None,
+    ) -> list[Plan]:
+        """Plan the activations of the ``bodies``, by default of all that have muscles, one after the other.
+
+        Args:
+            predicted: predicted end of the step; its activations and forces are replaced for each body.
+            plans: activations of all bodies before, and the contact forces that they cause.
+            memories: warm start of each body.
+            objectives: objectives of each body.
+            clock: timer of the stages.
+            bodies: bodies to be planned.
+        """
+        plans = list(plans)
+        forces = predicted.forces
+        for body in range(len(plans)) if bodies is None else bodies:
+            stepper = self.steppers[body]
+            if stepper.muscles.segment_count == 0:
+                continue
+            tensions = self._tensions([plan.activations for plan in plans])
+            tensions[body] = None
+            own = replace(
+                predicted, activations=plans[body].activations, forces=forces, body=body, other_tensions=tensions
+            )
+            planner = replace(stepper.planner, friction=self.contacts.friction)
+            plans[body] = planner.plan(own, memories[body].activations, objectives[body], clock)
+            forces = plans[body].forces
+            # The end that the last plan expects is the end that all plans expect together.
+            plans = [replace(plan, velocities=plans[body].velocities, forces=forces) for plan in plans]
+        return plans
+
+    def _solve(self, response: ContactLinearization, plans: Sequence[Plan]) -> CoupledResult:
+        tensions: Any = self._tensions([plan.activations for plan in plans])
+        return self.solver.solve(response, tensions, velocities=plans[0].velocities, forces=plans[0].forces)
+
+    def _replan(
+        self,
+        problem: IslandProblem,
+        plans: Sequence[Plan],
+        expected: np.ndarray,
+        result: CoupledResult,
+        memories: Memories,
+        objectives: Objectives,
+        clock: StageClock,
+    ) -> tuple[Sequence[Plan], CoupledResult]:
+        """Plan again, about the solved end, the creatures whose objectives cost clearly more than ``expected`` (k,).
+        Solve again, and return the plans and the result with the lower total value; see ``LocomotionStepper.step``."""
+        reached = self._values(problem, result.contacts, result, objectives)
+        worse = np.flatnonzero(reached > REPLAN_FACTOR * expected + REPLAN_MARGIN)
+        if len(worse) == 0:
+            return plans, result
+        response, bias = result.linearization, self.solver.normal_bias(result.contacts, problem.dt)
+        predicted = PredictedStep(response, bias, np.zeros(0), result.velocities, result.forces)
+        others = self._plan(predicted, plans, memories, objectives, clock, worse.tolist())
+        end = self._solve(response, others)
+        clock.lap("replan")
+        is_better = end.converged and self._values(problem, end.contacts, end, objectives).sum() < reached.sum()
+        chosen = others if is_better else plans
+        counted = [
+            one.counting(plan, other) if body in worse else one
+            for body, (one, plan, other) in enumerate(zip(chosen, plans, others, strict=True))
+        ]
+        return counted, end if is_better else result
+
+    def _values(
+        self, problem: IslandProblem, contacts: ContactSet, end: Plan | CoupledResult, objectives: Objectives
+    ) -> np.ndarray:
+        """Return the objective value of each body at ``end``."""
+        pushes = problem.split(contacts.nodal_forces(end.forces))
+        parts = zip(problem.problems, problem.split(end.velocities), pushes, objectives, strict=True)
+        return np.array(
+            [
+                objectives_value(
+                    own, contacts.with_nodes_of(problem.nodes_of(body)), targets, ends, push, own.body.speed_unit
+                )
+                for body, (own, ends, push, targets) in enumerate(parts)
+            ]
+        )
+
+    def _reports(
+        self, problem: IslandProblem, plans: Sequence[Plan], result: CoupledResult, clock: StageClock
+    ) -> list[StepReport]:
+        """Return the report of each body at the end of a solve."""
+        contacts, ends = result.contacts, problem.end_positions(result.velocities)
+        keys, end_gaps = self.contacts.pairs.keys(contacts.points), contacts.end_gaps(problem.dt, result.velocities)
+        lengths = self.contacts.tangent_lengths(keys)
+        contacts = replace(contacts, axes=contacts.axes / lengths[:, :, None])
+        forces = result.forces * lengths
+        min_gaps, tensions = self.contacts.min_gaps(ends), self._tensions([plan.activations for plan in plans])
+        clock.lap("report")
+        reports = []
+        for body, (own, end, velocities) in enumerate(
+            zip(problem.problems, problem.split(ends), problem.split(result.velocities), strict=True)
+        ):
+            chosen, own_contacts = self._contacts_of(body, keys, contacts, problem)
+            spin = own.momentum_correction(own.internal_gradient(velocities, tensions[body]))
+            plan = plans[body]
+            reports.append(
+                StepReport(
+                    state=BodyState(end, velocities, own.state.time + problem.dt),
+                    dt=problem.dt,
+                    contacts=own_contacts,
+                    forces=forces[chosen],
+                    end_gaps=end_gaps[chosen],
+                    min_gap=float(min_gaps[body]),
+                    activations=plan.activations,
+                    qp_count=plan.qp_count,
+                    qp_infeasible=plan.qp_infeasible,
+                    newton_iterations=result.iterations,
+                    converged=result.converged,
+                    added_spin=float(np.linalg.norm(spin)),
+                    milliseconds=clock.milliseconds,
+                )
+            )
+        return reports
+
+    def _contacts_of(
+        self, body: int, keys: np.ndarray, contacts: ContactSet, problem: IslandProblem
+    ) -> tuple[np.ndarray, ContactSet]:
+        """Return the indices of the contacts of a body, and these contacts with the nodes of this body alone.
+
+        A contact with another body has the face -1 minus its index in the world. Its point is (index + 1) P + p for the
+        own point p of P. For a point of the other body, it is negative and the frame is reversed, so that the same
+        forces act on this body.
+        """
+        pairs, start = self.contacts.pairs, int(problem.node_starts[body])
+        owned, touched = np.flatnonzero(keys[:, 0] == body), np.flatnonzero(keys[:, 1] == body)
+        chosen = np.concatenate([owned, touched])
+        others = np.array([*self.members, -1])[np.concatenate([keys[owned, 1], keys[touched, 0]])]
+        sides = np.repeat([0, 1], [len(owned), len(touched)])
+        entries = np.arange(len(chosen))
+        nodes = contacts.nodes[chosen].reshape(-1, 2, 4)[entries, sides] - start
+        weights = contacts.weights[chosen].reshape(-1, 2, 4)[entries, sides]
+        signs = 1.0 - 2.0 * sides
+        points = np.where(sides == 0, (others + 1) * pairs.point_counts[body] + keys[chosen, 2], -1 - keys[chosen, 2])
+        return chosen, ContactSet(
+            points,
+            nodes.astype(np.int32),
+            weights * signs[:, None],
+            contacts.axes[chosen] * signs[:, None, None],
+            contacts.gaps[chosen],
+            np.where(others < 0, contacts.faces[chosen], -1 - others).astype(np.int32),
+            len(problem.problems[body].node_mass),
+        )

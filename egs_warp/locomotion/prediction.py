@@ -1,0 +1,76 @@
+"""Prediction of the end of a step under given activations (Eq. 12), of one body or of an island."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.newton import ContactLinearization
+from egs_warp.locomotion.linear_step import PREDICTION_ITERATIONS
+
+
+class PredictionInputs(Protocol):
+    """Inputs of the prediction: ``StepInputs`` of one body, or ``IslandInputs``."""
+
+    @property
+    def problem(self) -> Any:
+        """``StepProblem`` or ``IslandProblem``."""
+        ...
+
+    @property
+    def contacts(self) -> ContactSet:
+        """Contacts of the step."""
+        ...
+
+    @property
+    def normal_bias(self) -> np.ndarray:
+        """(n,) m/s, velocity bias of each contact in the normal direction."""
+        ...
+
+    @property
+    def friction(self) -> float:
+        """Coulomb coefficient."""
+        ...
+
+    @property
+    def forces(self) -> np.ndarray:
+        """(n, 3) N, contact forces of the previous step."""
+        ...
+
+
+def predict_end(
+    linearizer: Any, factors: Any, start: PredictionInputs, tension: Any
+) -> tuple[ContactLinearization, np.ndarray, np.ndarray]:
+    """Predict the end of a step.
+
+    The prediction starts from a rigid motion of each body. One Newton step with the previous contact forces gives the
+    velocities at which the tangent is factored; the plan uses this tangent. Then ``PREDICTION_ITERATIONS`` Newton steps
+    solve for velocities and Coulomb forces. A Newton step that would invert an element is discarded.
+
+    Args:
+        linearizer: ``ContactLinearizer`` of the body, or ``IslandLinearizer``.
+        factors: linear solver of the body, or those of the bodies of the island.
+        start: inputs of the step.
+        tension: muscles of the body, or of the bodies of the island.
+
+    Returns:
+        The contact linearisation at the predicted end, the end velocities (N, 3) m/s, and the contact forces (n, 3) N.
+    """
+    problem, contacts, velocities = start.problem, start.contacts, start.problem.rigid_guess
+    # The tangent omits the stiffness of the muscles, which does not improve the prediction; only the solve uses it.
+    tangent = problem.tangent(factors, velocities, None)
+    newton_velocities = linearizer.predict_velocities(tangent, contacts, tension, velocities, start.forces)
+    if newton_velocities is not None:
+        velocities = newton_velocities
+        tangent = problem.tangent(factors, velocities, None)
+    response = linearizer(tangent, contacts)
+    iterate, forces = response.iterate_at(tension, velocities, start.forces), start.forces
+    for _ in range(PREDICTION_ITERATIONS):
+        newton_result = iterate.newton_steps(start.normal_bias, start.friction)
+        forces = newton_result.forces
+        if not newton_result.trial.is_inversion_free:
+            break
+        iterate = newton_result.trial
+    return response, iterate.velocities, forces

@@ -1,0 +1,166 @@
+"""Results of a simulated world: one film, and a trajectory and a report for each body."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.io.run_folder import RunFolder, run_folder
+from egs_warp.locomotion.ledger import energy_balance
+from egs_warp.motions.stance import REST_SPEED
+from egs_warp.pipelines.end_state import State
+from egs_warp.pipelines.report import (
+    GaussianCounts,
+    JsonValue,
+    Report,
+    has_failed_audit,
+    report_of_run,
+    verdict,
+    versions,
+    write_report,
+)
+from egs_warp.pipelines.shot import Shot
+from egs_warp.pipelines.simulated_run import BodyResult, SimulatedRun
+from egs_warp.pipelines.world_film import draw_world_film
+from egs_warp.pipelines.world_run import WorldRun
+from egs_warp.short_repr import short_repr
+
+COMMAND = "animate world"
+"""Command in the manifest of a run folder; such a run cannot be resumed."""
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class WorldReport:
+    """Contents of the ``report.json`` of a world, and the report of each body."""
+
+    __repr__ = short_repr
+
+    bodies: Mapping[str, Report]
+    """Reports by the names of the bodies."""
+    results: Mapping[str, str]
+    """One line on each body: what its motions reached, or how a prop has moved."""
+    stopped: bool
+    """True if the run ended at a step that could not be solved."""
+    film: str | None = None
+    """Name of the video in the folder of the run; None if it was not filmed."""
+    notes: tuple[str, ...] = ()
+    """Notes for the user."""
+    asked: Mapping[str, JsonValue] = field(default_factory=dict)
+    """Requested world, ready for JSON."""
+
+    @property
+    def state(self) -> State:
+        """Worst state of all bodies."""
+        states = tuple(report.state for report in self.bodies.values())
+        return State.STOPPED if self.stopped else State.worst(states)
+
+    def to_json(self) -> dict[str, JsonValue]:
+        """Return the whole report, ready for JSON."""
+        return {
+            "schema": SCHEMA_VERSION,
+            "state": self.state.value,
+            "bodies": {
+                name: {"state": report.state.value, "result": self.results[name], "report": f"{name}/report.json"}
+                for name, report in self.bodies.items()
+            },
+            "film": self.film,
+            "notes": list(self.notes),
+            "asked": dict(self.asked),
+            "versions": versions(),
+        }
+
+    def summary(self) -> str:
+        """Return one line for each body, and the verdict of the audit of all bodies."""
+        lines = [f"{name}: {result}" for name, result in self.results.items()]
+        audits = {name: report.audit for name, report in self.bodies.items()}
+        failed = [f"{name}: {verdict(audit)}" for name, audit in audits.items() if has_failed_audit(audit)]
+        return "\n".join([*lines, *(failed or ["audit: passed"])])
+
+
+def write_world(
+    run: WorldRun,
+    out: Path | str | RunFolder,
+    *,
+    film: bool = True,
+    shot: Shot | None = None,
+    size: int = 512,
+    view_from: Sequence[float] | None = None,
+    shadow: bool = True,
+    overwrite: bool = False,
+    quiet: bool = False,
+    notes: Sequence[str] = (),
+    asked: Mapping[str, JsonValue] | None = None,
+    show_note: Callable[[str], object] = lambda note: None,
+) -> WorldReport:
+    """Write the film of a simulated world, and the trajectory and the report of each body into a folder of its own.
+
+    Args:
+        run: The simulated world (``simulate``).
+        out: Folder for the results.
+        film: False writes no film.
+        shot: Camera, size, frame rate and background colour of the film.
+        size: Width and height of the film, pixels, if ``shot`` has no size.
+        view_from: (3,) Direction to the camera in the axes of the world; None chooses it.
+        shadow: Draw the shadows of the bodies.
+        overwrite: Move the files of an earlier run in ``out`` aside.
+        quiet: Show no progress bar.
+        notes: Notes for the report.
+        asked: Requested world for the report.
+        show_note: Called with each note on a motion or a push that did not take place.
+
+    Raises:
+        UserError: The folder cannot be written.
+    """
+    with run_folder(out, command=COMMAND, overwrite=overwrite) as folder:
+        reports: dict[str, Report] = {}
+        results: dict[str, str] = {}
+        for name, result in run.bodies.items():
+            # Saved first: an error while rendering does not lose the simulation.
+            place = folder.folder(name)
+            place.mkdir(exist_ok=True)
+            result.trajectory.save(place / "trajectory.npz")
+            unfinished = result.unfinished_note() if isinstance(result, SimulatedRun) else []
+            for note in unfinished:
+                show_note(f"{name}: {note}")
+            report = reports[name] = report_of_body(result, notes=unfinished)
+            results[name] = report.summary().splitlines()[0] if report.motion else displacement_text(result)
+            report.write(place / "report.json")
+        video = None
+        if film:
+            video = draw_world_film(run, folder, shot=shot, size=size, view_from=view_from, shadow=shadow, quiet=quiet)
+        whole = WorldReport(reports, results, run.stopped, video, tuple(notes), asked or {})
+        write_report(folder.file("report.json"), whole.to_json())
+        if not isinstance(out, RunFolder):
+            folder.finish()
+    return whole
+
+
+def report_of_body(result: BodyResult, *, notes: Sequence[str] = ()) -> Report:
+    """Return the report of one body of a world."""
+    simulation = result.simulation
+    return report_of_run(
+        *(result.body, simulation.trajectory, simulation.reports, simulation.frames),
+        *(result.records, energy_balance(simulation.trajectory)),
+        gaussians=GaussianCounts.of(result.body),
+        drawing={},
+        source="",
+        notes=notes,
+        seed=0,
+        asked={},
+        ending=result.ending,
+    )
+
+
+def displacement_text(result: BodyResult) -> str:
+    """Return one line on how a body has moved: the displacement of its centre of mass and its tilt at the end."""
+    t, body = result.simulation.trajectory, result.body.body
+    moved = body.centre_of_mass(t.positions[-1]) - body.centre_of_mass(t.positions[0])
+    turn = body.best_fit_rotation(t.positions[-1]) @ body.best_fit_rotation(t.positions[0]).T
+    tilt = np.degrees(np.arccos(np.clip(turn[2, 2], -1.0, 1.0)))
+    speed = float(np.linalg.norm(t.velocities[-1], axis=1).max())
+    rest = "at rest" if speed < REST_SPEED * body.speed_unit else f"still moving at {speed:.2g} m/s"
+    return f"moved by {np.hypot(*moved[:2]):.2f} m, tilted by {tilt:.0f} degrees, {rest}"

@@ -1,0 +1,144 @@
+"""A captured object as a body of a simulation: its Gaussians, its stepper and its state at rest on the ground.
+
+``Creature`` is a body with muscles, ``Prop`` a stiff body without muscles. ``CapturedBody.moved`` places a body
+anywhere on the ground: only the state moves. The rest shape, and all that is embedded in it (Gaussians, muscles,
+contact points, level set), stays in the frame of the cage, so that copies of a body share it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from egs_warp.contact.detection import ContactGeometry
+from egs_warp.contact.terrain import Surface
+from egs_warp.deformation.rigid import to_body_frame
+from egs_warp.errors import ArgumentError
+from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.geometry.body_frame import GROUND, BodyFrame
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.locomotion.settling import settle
+from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.meshing.level_set import MAX_CELLS, LevelSet, level_set_of_body
+from egs_warp.meshing.occupancy import LatticeSolid, solid_from_gaussians
+from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.short_repr import short_repr
+
+
+@dataclass(frozen=True)
+class CapturedShape:
+    """The captured shape of a body at rest, in the frame of its cage, for contact with other bodies."""
+
+    __repr__ = short_repr
+
+    gaussians: GaussianCloud
+    """Gaussians that define the body (``body_gaussians``), metres."""
+    contact_points: np.ndarray
+    """(P, 3) m, contact points at rest."""
+
+    @cached_property
+    def solid(self) -> LatticeSolid:
+        """Solid of the Gaussians, on a lattice of ``MAX_CELLS`` cells."""
+        return solid_from_gaussians(self.gaussians, resolution=MAX_CELLS)
+
+    @cached_property
+    def level_set(self) -> LevelSet:
+        """Level set of the shape (``level_set_of_body``). The first access takes seconds."""
+        return level_set_of_body(self.solid, self.contact_points)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CapturedBody:
+    """A capture with a soft body and a ground, at rest; metres.
+
+    ``cloud`` and the rest shape of ``stepper`` are in the frame of the cage, ``start`` is in the frame of the ground.
+    The two frames are equal unless the body has been placed with ``moved``.
+    """
+
+    __repr__ = short_repr
+
+    frame: BodyFrame
+    """Frame of ``start`` in the capture."""
+    cloud: GaussianCloud
+    """The Gaussians of the capture, in their original order, in the frame of the cage."""
+    stepper: LocomotionStepper
+    """Solver with body, muscles and contact."""
+    start: BodyState
+    """State at rest on the ground."""
+    solids: tuple[Surface, ...]
+    """Surfaces that the body can touch, the ground first."""
+    shape: CapturedShape
+    """Captured shape, for contact with other bodies."""
+    notes: tuple[str, ...] = ()
+    """Guesses about the capture, for the user."""
+
+    def placed(self, cloud: GaussianCloud) -> GaussianCloud:
+        """Transform another cloud of the same capture, such as its background, to the frame of ``start``."""
+        return to_body_frame(cloud, self.frame)
+
+    def moved(self, at: tuple[float, float, float] = (0.0, 0.0, 0.0), heading: float = 0.0) -> Self:
+        """Return the same body at rest elsewhere: turned about the vertical axis of the frame by ``heading`` degrees,
+        counter-clockwise seen from above, then moved by ``at``, m. Without a motion, it is this object."""
+        turn = Rotation.from_rotvec(np.radians(heading) * GROUND.normal).as_matrix()
+        shift = np.asarray(at, float)
+        if heading == 0.0 and not shift.any():
+            return self
+        return self._moved(turn, shift)
+
+    def with_friction(self, friction: float) -> Self:
+        """Return the same body at rest on ground with another Coulomb coefficient.
+
+        Raises ``ArgumentError`` for a negative one.
+        """
+        old = self.stepper
+        geometry, device = replace(old.geometry, friction=checked_friction(friction)), str(old.body.assembly.device)
+        stepper = LocomotionStepper(old.body, old.muscles, geometry, settings=old.settings, device=device)
+        return replace(self, stepper=stepper, start=settle(stepper))
+
+    def _moved(self, turn: np.ndarray, shift: np.ndarray) -> Self:
+        """Return the body after the rotation ``turn`` (3, 3) and the translation ``shift`` (3,) m."""
+        start, frame = self.start, self.frame
+        axes = turn @ frame.axes
+        return replace(
+            self,
+            frame=BodyFrame(axes, frame.origin - shift @ axes / frame.scale, frame.scale),
+            start=replace(start, positions=start.positions @ turn.T + shift, velocities=start.velocities @ turn.T),
+        )
+
+    @property
+    def body(self) -> SoftBody:
+        """The soft body."""
+        return self.stepper.body
+
+    @property
+    def mesh(self) -> TetMesh:
+        """Tetrahedra around the Gaussians, at rest."""
+        return self.stepper.body.mesh
+
+    @property
+    def muscles(self) -> MuscleSet:
+        """The muscles of the body."""
+        return self.stepper.muscles
+
+    @property
+    def geometry(self) -> ContactGeometry:
+        """Contact points, planes and friction."""
+        return self.stepper.geometry
+
+
+def points_at_rest(geometry: ContactGeometry) -> np.ndarray:
+    """Return the contact points (P, 3) m of ``geometry`` in the rest shape."""
+    mesh = geometry.mesh
+    return np.einsum("pw,pwi->pi", geometry.weights, mesh.nodes[mesh.tets[geometry.tet_from_point]])
+
+
+def checked_friction(friction: float) -> float:
+    """Return the Coulomb coefficient ``friction``. Raises ``ArgumentError`` if it is negative or not finite."""
+    if not 0.0 <= friction < np.inf:
+        raise ArgumentError("friction", "give a Coulomb coefficient of at least 0", value=friction)
+    return friction

@@ -1,0 +1,133 @@
+"""A prop: a captured object as a stiff body without muscles, for a world of several bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sparse
+
+from egs_warp.contact.detection import ContactGeometry, contact_geometry
+from egs_warp.contact.terrain import Solid
+from egs_warp.deformation.rigid import to_body_frame
+from egs_warp.errors import ArgumentError
+from egs_warp.fem.affine_body import VolumeMoments, affine_body
+from egs_warp.geometry.body_frame import GROUND
+from egs_warp.geometry.frames import Direction, direction_of
+from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.locomotion.settings import LocomotionSettings
+from egs_warp.locomotion.settling import settle
+from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, points_at_rest
+from egs_warp.pipelines.placed_cage import check_height, estimated_up, place_cage, simulation_device
+
+MIN_DENSITY, MAX_DENSITY = 1.0, 30_000.0
+"""Minimum and maximum density of a prop, kg/m^3; other values are rejected as a probable mistake in the units."""
+_CAGE_NODES = 250
+"""Approximate number of nodes of the cage in which the contact points of a prop are found."""
+_CONTACT_GRID = 2.0**-10
+"""Fraction of the height to which contact points are rounded, as for a creature."""
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Prop(CapturedBody):
+    """A stiff body of one tetrahedron without muscles, with the mass and the inertia of the captured object."""
+
+
+def make_prop(
+    cloud: GaussianCloud,
+    *,
+    up: Direction | None = None,
+    plane: Plane | None = None,
+    metres_per_unit: float | None = None,
+    height: float | None = None,
+    density: float = 1000.0,
+    friction: float = 0.8,
+    settings: LocomotionSettings | None = None,
+    progress: Callable[[str], object] = lambda stage: None,
+) -> Prop:
+    """Create a prop from a capture of a single object, at rest on the ground (docs/guide/worlds.md).
+
+    Args:
+        cloud: The capture.
+        up: (3,) Up direction in the capture, or an axis such as ``"-y"``; None uses the up direction of the file or
+            estimates it, as ``make_creature`` does.
+        plane: Ground plane in the capture; None uses the base of the object, orthogonal to ``up``.
+        metres_per_unit: Length of one unit of the capture, m; None uses ``height``.
+        height: Height of the prop, m; None makes it 1 m tall.
+        density: Density, kg/m^3.
+        friction: Coulomb coefficient of the ground.
+        settings: Contact settings; None uses the default.
+        progress: Called with the name of each stage as it starts.
+
+    Raises:
+        UserError: An argument is invalid, or the capture gives no body.
+    """
+    check_cloud(cloud)
+    if not MIN_DENSITY <= density <= MAX_DENSITY:
+        raise ArgumentError("density", f"give kg/m^3 from {MIN_DENSITY:g} to {MAX_DENSITY:g}", value=density)
+    check_height(height, metres_per_unit)
+    notes: tuple[str, ...] = ()
+    up = None if up is None else direction_of(up, "up")
+    if plane is None and up is None:
+        up, note = estimated_up(cloud, advice="give up")
+        notes = (note,)
+    progress("cage")
+    standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, height=height, nodes=_CAGE_NODES)
+    device, mesh = simulation_device(cloud), standing.cage.mesh
+    progress("contact")
+    grid = _CONTACT_GRID * standing.cage.height(GROUND)
+    geometry = contact_geometry(standing.gaussians, mesh, (GROUND,), friction=friction, grid=grid, device=device)
+    shape = CapturedShape(standing.gaussians, points_at_rest(geometry))
+    progress("body and level set")
+    body = affine_body(
+        VolumeMoments.of_solid(shape.solid), _height(shape), up=GROUND.normal, density=density, device=device
+    )
+    stepper = LocomotionStepper(
+        body, no_muscles(len(body.mesh.nodes)), embedded_in(body.mesh, geometry), settings=settings, device=device
+    )
+    progress("stand")
+    return Prop(
+        frame=standing.frame,
+        cloud=to_body_frame(cloud, standing.frame),
+        stepper=stepper,
+        start=settle(stepper),
+        solids=(Solid((GROUND,)),),
+        shape=shape,
+        notes=notes,
+    )
+
+
+def _height(shape: CapturedShape) -> float:
+    """Return the height of the contact points above the ground, m."""
+    return float(GROUND.heights(shape.contact_points).max())
+
+
+def embedded_in(mesh: TetMesh, geometry: ContactGeometry) -> ContactGeometry:
+    """Return all contact points of ``geometry`` in a ``mesh`` of one tetrahedron, which extrapolates exactly."""
+    points = points_at_rest(geometry)
+    corners = np.vstack([mesh.nodes[mesh.tets[0]].T, np.ones(4)])
+    weights = np.linalg.solve(corners, np.vstack([points.T, np.ones(len(points))])).T
+    return replace(
+        geometry, mesh=mesh, tet_from_point=np.zeros(len(points), np.int32), weights=np.ascontiguousarray(weights)
+    )
+
+
+def no_muscles(node_count: int) -> MuscleSet:
+    """Return the empty set of muscles of a body with ``node_count`` nodes."""
+    return MuscleSet(
+        end_rows=sparse.csr_matrix((0, node_count)),
+        segments=np.zeros((0, 2), np.int32),
+        rest_lengths=np.zeros(0),
+        stiffness=np.zeros(0),
+        bounds=np.zeros(0),
+        fibre_from_segment=np.zeros(0, np.int32),
+        fibre_kinds=(),
+        fibre_names=(),
+        fibre_groups=np.zeros(0, np.int32),
+        fibre_partners=np.zeros(0, np.int32),
+    )

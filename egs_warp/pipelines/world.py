@@ -1,0 +1,219 @@
+"""A world: several bodies, creatures and props, placed on a common ground."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from egs_warp.contact.detection import ContactDetector
+from egs_warp.contact.terrain import Solid, surface_above
+from egs_warp.errors import ArgumentError, UserError, did_you_mean
+from egs_warp.geometry.body_frame import GROUND
+from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
+from egs_warp.pipelines.captured_body import CapturedBody, checked_friction
+from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.prop import Prop
+from egs_warp.short_repr import short_repr
+
+_MAX_OVERLAP = 0.005
+"""Depth, in heights of the lower body, up to which bodies may overlap at the start."""
+_MAX_DEPTH = 0.01
+"""Depth in an obstacle, in body heights, up to which a body may be placed."""
+_MAX_POSITION = 1e4
+"""Maximum coordinate of a place, m."""
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedBody:
+    """A body of a world at its place, as ``World.add`` returns it."""
+
+    __repr__ = short_repr
+
+    name: str
+    """Name of the body, unique in its world."""
+    body: Creature | Prop
+    """The body at its place, at rest on the ground of the world."""
+
+
+class World:
+    """Bodies on a common ground: the plane z = 0 of the world, whose z axis points up, and solids on it.
+
+    Add bodies with ``add``, then call ``simulate(world, {member: motion, ...})``. Lengths are in metres.
+    """
+
+    def __init__(self, *, solids: Sequence[Solid] = (), friction: float | None = None) -> None:
+        """Create a world without bodies.
+
+        Args:
+            solids: Steps, ramps and walls in addition to the ground, in the frame of the world.
+            friction: Coulomb coefficient of the ground and between bodies; None keeps the one of each body.
+
+        Raises:
+            UserError: The friction is invalid.
+        """
+        self.solids = tuple(solids)
+        self.friction = None if friction is None else checked_friction(friction)
+        self._members: dict[str, PlacedBody] = {}
+
+    def __repr__(self) -> str:
+        return f"World({', '.join(self._members) or 'empty'})"
+
+    @property
+    def members(self) -> tuple[PlacedBody, ...]:
+        """The bodies in the order in which they were added."""
+        return tuple(self._members.values())
+
+    def add(
+        self,
+        body: Creature | Prop,
+        *,
+        at: tuple[float, float] = (0.0, 0.0),
+        above: float = 0.0,
+        heading: float | None = None,
+        name: str | None = None,
+    ) -> PlacedBody:
+        """Place a body on the ground.
+
+        Args:
+            body: A creature or a prop on level ground without solids of its own. The same body may be added repeatedly.
+            at: Position of the origin of the body's frame, m.
+            above: Height above the ground or the solid below, m; above 0, the body falls.
+            heading: Direction in which a creature faces, degrees counter-clockwise from the x axis of the world, seen
+                from above. A prop is turned by this angle. None keeps the orientation of the body's own frame.
+            name: Name for messages and files; None numbers the bodies: ``creature-1``, ``prop-2``.
+
+        Returns:
+            The placed body by which ``simulate`` and its result name the body.
+
+        Raises:
+            UserError: The name is taken, the body has its own terrain, or it overlaps a solid or another body.
+        """
+        kind = "prop" if isinstance(body, Prop) else "creature"
+        name = f"{kind}-{len(self._members) + 1}" if name is None else name
+        self._check_name(name)
+        numbers = [*at, above, heading or 0.0]
+        # Not "any above the maximum", because NaN must be rejected, too.
+        if not np.abs(numbers).max() <= _MAX_POSITION or above < 0.0:
+            given = f"at {at[0]:g}, {at[1]:g}, above {above:g}, heading {heading or 0.0:g}"
+            raise UserError(f"{name}: {given}: give finite numbers up to {_MAX_POSITION:g}, and above of at least 0")
+        geometry, gravity = body.geometry, body.body.gravity
+        if geometry.field is not None or len(geometry.planes) > 1 or np.abs(gravity[:2]).max() > 0.0:
+            raise UserError(f"{name}: its ground is not a level plane; make it without ground, gravity_up and solids")
+        if self.friction is not None and self.friction != geometry.friction:
+            body = body.with_friction(self.friction)
+        point = np.array([*at, 0.0])
+        surfaces = (Solid((GROUND,)), *self.solids)
+        lift = surface_above(surfaces, point, GROUND.normal)
+        captured_heading = _heading_of(body) if isinstance(body, Creature) else 0.0
+        placed = body.moved((*at, lift + above), 0.0 if heading is None else heading - captured_heading)
+        placed = replace(placed, stepper=self._own_stepper(placed), solids=surfaces)
+        member = PlacedBody(name, placed)
+        self._check_place(member)
+        for other in self._members.values():
+            check_apart(other, member)
+        self._members[name] = member
+        return member
+
+    def member(self, name: str) -> PlacedBody:
+        """Return the body ``name``."""
+        return self._members[name]
+
+    def by_name(self, values: Mapping[PlacedBody | str, Value], what: str) -> dict[str, Value]:
+        """Return ``values`` by the names of the bodies. Raises ``UserError``, which names ``what`` is given, for a
+        body that is not in the world."""
+        named: dict[str, Value] = {}
+        for key, value in values.items():
+            name = key if isinstance(key, str) else key.name
+            if name not in self._members or (not isinstance(key, str) and self._members[name] is not key):
+                raise UserError(
+                    f"{what} of {name!r}: the world has no such body{did_you_mean(name, self._members)};"
+                    f" give one of {', '.join(self._members)}"
+                )
+            named[name] = value
+        return named
+
+    def stepper(self) -> WorldStepper:
+        """Return the stepper of all bodies. The first call for a body computes its level set, which takes seconds."""
+        bodies = [member.body for member in self.members]
+        return WorldStepper([WorldBody(body.stepper, body.shape.level_set, body.mesh.nodes) for body in bodies])
+
+    def _check_name(self, name: str) -> None:
+        if not name or not all(letter.isalnum() or letter in "-_" for letter in name):
+            raise ArgumentError(
+                "name", "give letters, digits, - and _; it becomes the name of a folder", value=repr(name)
+            )
+        if name in self._members:
+            raise ArgumentError("name", "another body of the world has this name; choose another one", value=repr(name))
+
+    def _own_stepper(self, body: CapturedBody) -> LocomotionStepper:
+        """Return the stepper of ``body`` on the ground of the world. Bodies do not share steppers, which have
+        buffers."""
+        old = body.stepper
+        if self.solids:
+            geometry = replace(
+                old.geometry,
+                planes=(*old.geometry.planes, *(face for solid in self.solids for face in solid.faces)),
+                solid_from_plane=(0, *(index for index, solid in enumerate(self.solids, 1) for _ in solid.faces)),
+            )
+            device = str(old.body.assembly.device)
+            return LocomotionStepper(deepcopy(old.body), old.muscles, geometry, settings=old.settings, device=device)
+        is_taken = any(member.body.stepper is old for member in self._members.values())
+        return deepcopy(old) if is_taken else old
+
+    def _check_place(self, member: PlacedBody) -> None:
+        """Raise ``UserError`` if a body is inside a solid of the world."""
+        body = member.body
+        detector: ContactDetector = body.stepper.detector
+        gaps, faces = detector.gaps(body.start.positions)
+        deepest = int(np.argmin(gaps))
+        if gaps[deepest] < -_MAX_DEPTH * body.body.height:
+            solid = int(body.geometry.solid_of_each_plane[faces[deepest]])
+            what = f"solid {solid}" if solid else "the ground"
+            raise UserError(f"{member.name}: it is {-gaps[deepest]:.2g} m inside {what} at {_where(member)}; move one")
+
+
+def check_apart(first: PlacedBody, second: PlacedBody) -> None:
+    """Raise ``UserError`` if two bodies overlap at the start: a contact point of one is inside the level set of the
+    other."""
+    depth = max(_depth(first.body, second.body), _depth(second.body, first.body))
+    if depth > _MAX_OVERLAP * min(first.body.body.height, second.body.body.height):
+        raise UserError(
+            f"{second.name} at {_where(second)} overlaps {first.name} at {_where(first)} by {depth:.2g} m; move one of"
+            " them"
+        )
+
+
+def _depth(body: CapturedBody, other: CapturedBody) -> float:
+    """Return the depth in metres of the deepest contact point of ``body`` in ``other``; 0 if their boxes are apart."""
+    points, theirs = _contact_points(body), _contact_points(other)
+    if (points.min(axis=0) > theirs.max(axis=0)).any() or (theirs.min(axis=0) > points.max(axis=0)).any():
+        return 0.0
+    shape, at = other.body, other.start.positions
+    turn = shape.best_fit_rotation(at)
+    rest = (points - shape.centre_of_mass(at)) @ turn + shape.centre_of_mass(shape.mesh.nodes)
+    return max(0.0, -float(other.shape.level_set.evaluate(rest)[0].min()))
+
+
+def _contact_points(body: CapturedBody) -> np.ndarray:
+    """Return the contact points (P, 3) m of a body at its start."""
+    geometry = body.geometry
+    nodes = body.start.positions[geometry.mesh.tets[geometry.tet_from_point]]
+    return np.einsum("pw,pwi->pi", geometry.weights, nodes)
+
+
+def _heading_of(creature: Creature) -> float:
+    """Return the direction in which the creature faces, degrees from the x axis."""
+    x, y, _ = creature.front.direction
+    return float(np.degrees(np.arctan2(y, x)))
+
+
+def _where(member: PlacedBody) -> str:
+    # Adding zero turns -0 into 0.
+    x, y, _ = np.round(member.body.body.centre_of_mass(member.body.start.positions), 2) + 0.0
+    return f"({x:.2f}, {y:.2f})"

@@ -1,0 +1,139 @@
+"""Film of a simulated world: all bodies are deformed and drawn together, with their shadows on the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.deformation.joint_deformer import JointDeformer
+from egs_warp.geometry.body_frame import GROUND, BodyFrame
+from egs_warp.geometry.camera import Camera
+from egs_warp.io.run_folder import RunFolder
+from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.film import Filmed, encode_film, path_of, rendered_frames, split_deformer
+from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
+from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW
+from egs_warp.pipelines.world_run import WorldRun
+
+_ELEVATION = 0.35
+"""Ratio of the vertical to the horizontal component of the direction to the camera, higher than for one body so that
+the ground between the bodies is visible."""
+_VIEWS = 24
+"""Number of directions that are compared."""
+_FACING_WEIGHT = 0.6
+"""Weight of the faces relative to the separation of the bodies in the choice of the view."""
+
+
+@dataclass(frozen=True)
+class WorldMotion:
+    """Nodes of all bodies in each frame of a run, for cameras (``FilmedMotion``)."""
+
+    time: np.ndarray
+    """(n,) s, time of each frame."""
+    positions: np.ndarray
+    """(n, N, 3) m, nodes of all bodies, one body after the other."""
+    node_mass: np.ndarray
+    """(N,) kg."""
+    capture_frame: BodyFrame
+    """Frame of the world: cameras from a file are in metres and in the axes of the world."""
+
+    @classmethod
+    def from_run(cls, run: WorldRun) -> WorldMotion:
+        """Return the motion of all bodies of ``run``."""
+        parts = [result.simulation for result in run.results]
+        return cls(
+            run.time,
+            np.concatenate([part.trajectory.positions[part.frames] for part in parts], axis=1),
+            np.concatenate([part.trajectory.node_mass for part in parts]),
+            BodyFrame(np.eye(3), np.zeros(3), 1.0),
+        )
+
+
+def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | None = None) -> Camera:
+    """Return a fixed camera that shows all bodies during the whole run.
+
+    By default it looks from the direction in which the bodies hide each other least and the creatures face the camera.
+
+    Args:
+        run: The simulated world.
+        size: Width and height of the image, pixels.
+        view_from: (3,) Direction to the camera in the axes of the world.
+    """
+    points = WorldMotion.from_run(run).positions.reshape(-1, 3)
+    direction = _clearest_view(run) if view_from is None else np.asarray(view_from, float)
+    direction = direction / np.linalg.norm(direction)
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, distance = 0.5 * (low + high), float(np.linalg.norm(high - low))
+    camera = Camera.look_at(
+        middle + distance * direction,
+        middle,
+        np.array([0.0, 1.0, 0.0]) if abs(direction[2]) > 0.9999 else GROUND.normal,
+        width=size,
+        height=size,
+        vertical_fov_degrees=FIELD_OF_VIEW,
+    )
+    return framed(camera, points)
+
+
+def draw_world_film(
+    run: WorldRun,
+    folder: RunFolder,
+    *,
+    name: str = "world",
+    size: int = 512,
+    shot: Shot | None = None,
+    view_from: Sequence[float] | None = None,
+    shadow: bool = True,
+    quiet: bool = False,
+) -> str:
+    """Render a simulated world and write its video and ``sheet.png``; return the name of the video.
+
+    Args:
+        run: The simulated world.
+        folder: Folder for the files.
+        name: Name of the video, without its ending.
+        size: Width and height of the video, pixels, if ``shot`` has no size.
+        shot: Camera, size, frame rate and background colour.
+        view_from: (3,) Direction to the camera in the axes of the world; None chooses it (``world_camera``).
+        shadow: Draw the shadows of the bodies on the ground.
+        quiet: Show no progress bar.
+    """
+    shot = shot or Shot()
+    motion = WorldMotion.from_run(run)
+    steps = np.arange(len(motion.time)) if shot.fps == FRAME_RATE else nearest_steps(motion.time, shot.fps)
+    camera = resized(world_camera(run, size, view_from), *(shot.size or (size, size)))
+    cameras = shot.cameras(camera, motion, steps)
+    deformer = JointDeformer([split_deformer(result) for result in run.results])
+    simulations = [result.simulation for result in run.results]
+    poses = ([each.trajectory.positions[each.frames[step]] for each in simulations] for step in steps)
+    filmed = Filmed(
+        np.concatenate([path_of(each.trajectory) for each in simulations]),
+        max(each.trajectory.height for each in simulations),
+    )
+    frames = rendered_frames(deformer.deform, deformer.rest, poses, filmed, cameras, shot, shadow=shadow)
+    path, _ = encode_film(frames, folder, name, cameras[0], shot, motion.time[steps], quiet=quiet)
+    return path.name
+
+
+def _clearest_view(run: WorldRun) -> np.ndarray:
+    """Return the direction (3,) to the camera in which the bodies are separate and the creatures face the camera."""
+    simulations = [result.simulation for result in run.results]
+    paths = np.stack([path_of(each.trajectory)[each.frames][:, :2] for each in simulations])
+    radii = [0.5 * float(np.ptp(each.trajectory.positions[0][:, :2], axis=0).max()) for each in simulations]
+    faces = [result.body.front.direction[:2] for result in run.results if isinstance(result.body, Creature)]
+    first, second = np.triu_indices(len(simulations), 1)
+    reach = np.array(radii)[first] + np.array(radii)[second]
+    angles = 2.0 * np.pi * (np.arange(_VIEWS) + 0.5) / _VIEWS
+    best, best_score = angles[0], -np.inf
+    for angle in angles:
+        towards, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        apart = np.abs((paths[first] - paths[second]) @ across)
+        separation = float(np.minimum(apart / reach[:, None], 1.0).mean()) if len(first) else 1.0
+        # A three-quarter view shows a face best.
+        facing = float(np.mean([min(face @ towards, 0.8) for face in faces])) if faces else 0.0
+        if separation + _FACING_WEIGHT * facing > best_score:
+            best, best_score = angle, separation + _FACING_WEIGHT * facing
+    return np.array([np.cos(best), np.sin(best), _ELEVATION])

@@ -1,0 +1,186 @@
+"""Simulation of a world: each creature performs its motions, props are passive, and all bodies advance in lockstep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.rollout import FRAME_RATE, BodyRun, RolloutResult
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.locomotion.world_rollout import roll_out_world, world_steps
+from egs_warp.motions.push import Push
+from egs_warp.motions.script import Script
+from egs_warp.motions.sequence import MotionRecord
+from egs_warp.motions.stance import RestDetector
+from egs_warp.motions.style import Style
+from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.end_state import EndCause
+from egs_warp.pipelines.prop import Prop
+from egs_warp.pipelines.simulated_run import BodyResult, Performer, SimulatedRun, check_frames
+from egs_warp.pipelines.world import PlacedBody, World
+from egs_warp.short_repr import short_repr
+
+STANDING = "stand"
+"""Motion of a creature without one."""
+_PROP_TIME = 10.0
+"""Time limit of a world of props, s, and time after the last motion in which props may come to rest."""
+
+
+@dataclass(frozen=True)
+class PropRun:
+    """Result of a prop in a world."""
+
+    __repr__ = short_repr
+
+    prop: Prop
+    simulation: RolloutResult
+    """Trajectory and reports of all steps."""
+
+    @property
+    def body(self) -> Prop:
+        """The prop, as the body of a world (``BodyResult``)."""
+        return self.prop
+
+    @property
+    def records(self) -> Sequence[MotionRecord]:
+        """Records of motions: none."""
+        return ()
+
+    @property
+    def ending(self) -> EndCause:
+        """Cause that ended the run early, if any."""
+        return EndCause(stopped=self.simulation.stopped)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Every solver step, in the frame of the world."""
+        return self.simulation.trajectory
+
+    @property
+    def frames(self) -> np.ndarray:
+        """(n, 4, 3) m, nodes of the tetrahedron in each frame of a video at 60 Hz."""
+        return self.trajectory.positions[self.simulation.frames]
+
+
+@dataclass(frozen=True)
+class WorldRun:
+    """Result of ``simulate`` for a world: the result of each body."""
+
+    world: World
+    bodies: Mapping[str, SimulatedRun | PropRun]
+    """Results by the names of the bodies, in the order in which these were added."""
+
+    def __repr__(self) -> str:
+        return f"WorldRun({', '.join(f'{name}: {run!r}' for name, run in self.bodies.items())})"
+
+    def __getitem__(self, member: PlacedBody | str) -> SimulatedRun | PropRun:
+        """Return the result of one body."""
+        return self.bodies[member if isinstance(member, str) else member.name]
+
+    @property
+    def results(self) -> Sequence[BodyResult]:
+        """Results of all bodies."""
+        return tuple(self.bodies.values())
+
+    @property
+    def time(self) -> np.ndarray:
+        """(n,) s, time of each frame of a video."""
+        first = self.results[0].simulation
+        return first.trajectory.time[first.frames]
+
+    @property
+    def stopped(self) -> bool:
+        """True if the run ended at a step that could not be solved."""
+        return self.results[0].simulation.stopped
+
+
+class PassiveMotion:
+    """Motion of a prop: it has no objectives. Detects when the prop is at rest."""
+
+    def __init__(self, prop: Prop) -> None:
+        self._rest = RestDetector(prop.body)
+        self.is_at_rest = False
+        """True once the fastest node has been slow for a while (``RestDetector``)."""
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
+        """Update ``is_at_rest``; return no objectives."""
+        fastest = int(np.argmax(np.linalg.norm(state.velocities, axis=1)))
+        self.is_at_rest = self._rest.update(state.velocities[fastest], state.time)
+        return []
+
+
+def simulate_world(
+    world: World,
+    motions: Mapping[PlacedBody | str, Script | str],
+    *,
+    frames: int | None = None,
+    max_seconds: float | None = None,
+    step: float | None = None,
+    style: Style | None = None,
+    pushes: Mapping[PlacedBody | str, Sequence[Push]] | None = None,
+    get_up: bool = True,
+    progress: Callable[[int, int], object] = lambda done, expected: None,
+) -> WorldRun:
+    """Simulate a world; the arguments are described at ``simulate``."""
+    check_frames(frames)
+    if not world.members:
+        raise UserError("world: it has no body; add a creature or a prop")
+    scripts = world.by_name(motions, "motion")
+    pushes_on = world.by_name(pushes or {}, "pushes")
+    for name in [*scripts, *pushes_on]:
+        if isinstance(world.member(name).body, Prop):
+            raise UserError(f"{name}: it is a prop, which has no muscles and no motion; make it with make_creature")
+    dt, _ = world_steps([member.body.body for member in world.members], step)
+    performers: dict[str, Performer] = {}
+    passive: dict[str, PassiveMotion] = {}
+    runs: list[BodyRun] = []
+    for member in world.members:
+        name, body = member.name, member.body
+        if isinstance(body, Creature):
+            try:
+                performer = performers[name] = Performer(
+                    body,
+                    scripts.get(name, STANDING),
+                    frames=frames,
+                    max_seconds=max_seconds,
+                    step=dt,
+                    style=style,
+                    pushes=pushes_on.get(name, ()),
+                    get_up=get_up,
+                )
+            except UserError as error:
+                raise UserError(f"{name}: {error}") from error
+            motion, kicks, front = performer.watch, performer.kicks, body.front.direction
+            runs.append(
+                BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame, front=front, kicks=kicks)
+            )
+        else:
+            motion = passive[name] = PassiveMotion(body)
+            runs.append(BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame))
+    settling = round(_PROP_TIME * FRAME_RATE) if passive and frames is None else 0
+    limit = max([performer.frame_limit for performer in performers.values()], default=0) + settling
+    limit = limit if frames is None else frames - 1
+
+    def is_over() -> bool:
+        at_rest = all(motion.is_at_rest for motion in passive.values())
+        return frames is None and at_rest and all(performer.is_over for performer in performers.values())
+
+    def report_progress(last: int) -> None:
+        done = last + 1
+        progress(done, max([performer.expected_frames(done) for performer in performers.values()], default=limit))
+
+    results = roll_out_world(world.stepper(), runs, frames=limit, step=step, finished=is_over, progress=report_progress)
+    bodies: dict[str, SimulatedRun | PropRun] = {}
+    for member, result in zip(world.members, results, strict=True):
+        if member.name in performers:
+            bodies[member.name] = performers[member.name].result(result)
+        else:
+            assert isinstance(member.body, Prop)
+            bodies[member.name] = PropRun(member.body, result)
+    return WorldRun(world, bodies)

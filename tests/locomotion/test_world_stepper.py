@@ -1,0 +1,108 @@
+"""Several bodies in one world, against closed forms of collision, rest and sliding, and against one body alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
+from egs_warp.motions.script import motion as script
+from egs_warp.motions.sequence import MotionSequence
+from tests.support.creatures import coarse_creature
+from tests.support.meshes import block_mesh
+from tests.support.passive import ABYSS
+from tests.support.props import RunningWorld, box_body
+
+DT = 1 / 120
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_a_collision_in_flight_conserves_momenta_and_does_not_rebound(soft: bool) -> None:
+    size, heavier = (0.4, 0.4, 0.4), (0.8, 0.4, 0.4)
+    bodies = [box_body(size, plane=ABYSS), box_body(heavier, plane=ABYSS, soft=soft)]
+    world = RunningWorld(bodies, [(0.0, 0.0, 0.0), (0.63, 0.0, 0.05 * soft)], [(1.0, 0.0, 0.0), (0.0, 0.0, 0.0)])
+    mass, gravity = sum(body.mass for body in world.bodies), world.bodies[0].gravity
+    linear, angular = world.momenta()
+    touched = False
+    for _ in range(20):
+        weighted = sum(b.mass * c for b, c in zip(world.bodies, world.centres(), strict=True))
+        linear, angular = linear + DT * mass * gravity, angular + DT * np.cross(weighted, gravity)
+        world.advance(DT)
+        touched |= any((report.forces[:, 0] > 0.0).any() for reports in world.reports for report in reports)
+        # The arms of the weight are those at the start of a step; implicit Euler moves along the final velocity.
+        now = world.momenta()
+        assert np.abs(now[0] - linear).max() < 1e-12 * mass
+        assert np.abs(now[1] - angular).max() < 1e-12 * mass
+    assert touched and world.min_gap > -0.01 * size[2]
+    speeds = [b.centre_of_mass(s.velocities)[0] for b, s in zip(world.bodies, world.states, strict=True)]
+    if soft:
+        assert 0.0 < speeds[1] - speeds[0] < 1.0
+    else:
+        assert np.allclose(speeds, 1.0 / 3.0, atol=1e-4)
+
+
+def test_a_prop_comes_to_rest_on_a_soft_block_that_carries_its_weight() -> None:
+    bodies = [box_body((0.5, 0.5, 0.4), soft=True), box_body((0.3, 0.3, 0.3))]
+    world = RunningWorld(bodies, [(0.0, 0.0, 0.0), (0.03, 0.02, 0.402)], [(0.0, 0.0, 0.0), (0.0, 0.0, -0.3)])
+    for _ in range(120):
+        world.advance(DT)
+    assert world.min_gap > -0.01 * 0.3 and np.abs(world.states[1].velocities).max() < 2e-3
+    forces = []
+    for (report,), other in zip(world.reports, (1, 0), strict=True):
+        with_other = report.contacts.faces == -1 - other
+        forces.append(np.einsum("na,nai->i", report.forces[with_other], report.contacts.axes[with_other]))
+    weight = world.bodies[1].weight
+    assert np.abs(forces[0] + forces[1]).max() < 1e-12 * weight
+    assert np.allclose(forces[1], [0.0, 0.0, weight], atol=0.01 * weight)
+
+
+@pytest.mark.slow
+def test_a_stack_of_five_stands_for_ten_seconds() -> None:
+    world = RunningWorld([box_body((0.3, 0.3, 0.2)) for _ in range(5)], [(0.01 * i, 0.0, 0.201 * i) for i in range(5)])
+    for _ in range(round(10.0 / DT)):
+        world.advance(DT)
+    expected = [(0.01 * i, 0.0, 0.1 + 0.2 * i) for i in range(5)]
+    assert np.allclose(world.centres(), expected, atol=1e-3)
+    assert world.min_gap > -0.01 * 0.2
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_a_block_slides_down_another_above_the_angle_of_friction_only(factor: float) -> None:
+    friction, slope = 0.5, np.arctan(0.5 * factor)
+    up = np.array([-np.sin(slope), 0.0, np.cos(slope)])
+    bodies = [box_body((1.6, 0.8, 0.2), up=up, friction=0.9), box_body((0.2, 0.2, 0.1), up=up, friction=0.1)]
+    frictions = np.full((2, 2), friction)
+    world = RunningWorld(bodies, [(0.0, 0.0, 0.0), (-0.4, 0.0, 0.2)], frictions=frictions)
+    for _ in range(60):
+        world.advance(DT)
+    moved = world.centres()[1] - world.centres()[0]
+    acceleration = max(9.81 * (np.sin(slope) - friction * np.cos(slope)), 0.0)
+    # Implicit Euler moves by dt^2 a n (n + 1) / 2 in n steps.
+    expected = 0.5 * acceleration * DT**2 * 60 * 61
+    assert moved[0] + 0.4 == pytest.approx(expected, abs=2e-3)
+    assert abs(moved[1]) < 1e-3
+
+
+def test_bodies_that_are_apart_move_as_they_do_alone() -> None:
+    made = coarse_creature(block_mesh(), forward=np.array([1.0, 0.0, 0.0]))
+    level_set = box_body((0.2, 0.2, 0.2)).level_set
+    prop = box_body((0.2, 0.2, 0.2), friction=made.stepper.geometry.friction)
+    nodes = made.stepper.body.mesh.nodes
+    world = WorldStepper([WorldBody(made.stepper, level_set, nodes), prop])
+    states = [made.start, BodyState(prop.rest_positions + [5.0, 0.0, 0.1], np.zeros((4, 3)))]
+    memories, stance = world.initial_memories(), made.place
+    alone, alone_memory = made.start, memories[0]
+    sequences = [MotionSequence(stance, script("jump").parts(made.stepper.body.height)) for _ in range(2)]
+    report = alone_report = None
+    for _ in range(4):
+        dt = made.stepper.body.time_unit / 20.0
+        assert world.islands(states, dt) == [(0,), (1,)]
+        targets = sequences[0].objectives(states[0], report, dt)
+        done = world.advance(states, memories, [targets, ()], dt)
+        states, report = [each[-1].state for each in done], done[0][-1]
+        memories = [type(memories[0]).from_report(each[-1]) for each in done]
+        own = sequences[1].objectives(alone, alone_report, dt)
+        alone, alone_memory, reports = made.stepper.advance(alone, alone_memory, own, dt)
+        alone_report = reports[-1]
+        assert np.array_equal(states[0].positions, alone.positions)

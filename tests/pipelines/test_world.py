@@ -1,0 +1,102 @@
+"""Worlds: one creature gives the bits of ``simulate``, distant bodies do not affect each other, a dropped prop comes to
+rest, and invalid worlds are refused with the name and the place of the body."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from egs_warp.assets import pawn
+from egs_warp.contact.terrain import Solid
+from egs_warp.errors import UserError
+from egs_warp.geometry.plane import Plane
+from egs_warp.pipelines.prop import Prop, make_prop
+from egs_warp.pipelines.simulated_run import simulate
+from egs_warp.pipelines.world import World
+from egs_warp.pipelines.world_run import simulate_world
+from tests.support.creatures import coarse_pawn
+
+WALL = Solid((Plane(np.array([-1.0, 0.0, 0.0]), 1.0),))
+"""Everything beyond x = 1."""
+
+
+@cache
+def prop() -> Prop:
+    scene = pawn(gaussian_count=3000, device="cpu")
+    return make_prop(scene.cloud, plane=scene.plane, density=200.0, height=0.5)
+
+
+def test_a_moved_body_keeps_its_place_in_the_capture() -> None:
+    creature = coarse_pawn()
+    assert creature.moved() is creature
+    moved = creature.moved((1.0, 2.0, 0.5), 90.0)
+    x, y, z = creature.start.positions.T
+    np.testing.assert_allclose(moved.start.positions, np.stack([1.0 - y, 2.0 + x, 0.5 + z], axis=1), atol=1e-12)
+    places = [one.frame.capture_points(one.start.positions) for one in (creature, moved)]
+    np.testing.assert_allclose(*places, atol=1e-12)
+    np.testing.assert_allclose(moved.front.direction @ creature.front.direction, 0.0, atol=1e-12)
+    assert moved.body is creature.body and moved.shape is creature.shape
+
+
+@pytest.mark.slow
+def test_a_world_of_one_creature_gives_the_bits_of_the_creature_alone() -> None:
+    creature, world = coarse_pawn(), World()
+    world.add(creature, name="pawn")
+    alone = simulate(creature, "jump", frames=12).trajectory
+    together = simulate_world(world, {"pawn": "jump"}, frames=12)["pawn"].trajectory
+    for name in alone.__dataclass_fields__:
+        assert np.array_equal(getattr(alone, name), getattr(together, name), equal_nan=True), name
+
+
+@pytest.mark.slow
+def test_distant_bodies_do_not_affect_each_other() -> None:
+    """A creature 3 m away, turned by 90 degrees, moves as the creature alone does. A prop falls from 0.1 m in
+    sqrt(2 * 0.1 / g) = 0.143 s and comes to rest where it was dropped."""
+    creature, world = coarse_pawn(), World(friction=0.8)
+    forward = np.degrees(np.arctan2(*creature.front.direction[[1, 0]]))
+    near = world.add(creature)
+    far = world.add(creature, at=(3.0, 0.0), heading=forward + 90.0)
+    box = world.add(prop(), at=(0.0, 2.0), above=0.1)
+    assert near.body.stepper is not far.body.stepper
+    run = simulate_world(world, {near: "jump 0.3"}, frames=60)
+    t = run[box].trajectory
+    heights = t.positions.mean(axis=1)[:, 2] - prop().start.positions.mean(axis=0)[2]
+    landing = t.time[np.argmax(heights < 1e-3)]
+    assert heights[0] == pytest.approx(0.1, abs=1e-9) and landing == pytest.approx(0.143, abs=0.02)
+    assert np.abs(t.velocities[-1]).max() < 1e-3 and abs(heights[-1]) < 1e-3
+    assert np.abs(t.positions[-1, :, :2] - t.positions[0, :, :2]).max() < 1e-3
+    assert (run[far].trajectory.contact_plane == 0).all()
+    alone = simulate(creature, "jump 0.3", step=float(run[near].trajectory.dt[0]), frames=60).trajectory
+    assert np.array_equal(alone.positions, run[near].trajectory.positions)
+    standing = run[far].trajectory.positions
+    assert np.abs(standing[-1] - standing[0]).max() < 0.01
+
+
+def test_invalid_worlds_are_refused_with_the_name_and_the_place() -> None:
+    creature, world = coarse_pawn(), World(solids=[WALL])
+    world.add(prop(), name="box")
+    with pytest.raises(UserError, match="another body of the world has this name"):
+        world.add(creature, at=(0.0, 3.0), name="box")
+    with pytest.raises(UserError, match=r"^king: it is .* m inside solid 1 at \(1\.[0-9]+, 0\.00\); move one"):
+        world.add(creature, at=(1.1, 0.0), name="king")
+    with pytest.raises(UserError, match=r"^king: at nan, 0, above 0, heading 0: give finite numbers"):
+        world.add(creature, at=(np.nan, 0.0), name="king")
+    with pytest.raises(UserError, match=r"motion of 'bos': the world has no such body \(did you mean 'box'\?\)"):
+        simulate_world(world, {"bos": "jump"})
+    with pytest.raises(UserError, match="box: it is a prop, which has no muscles"):
+        simulate_world(world, {"box": "jump"})
+    with pytest.raises(UserError, match="world: it has no body"):
+        simulate_world(World(), {})
+
+
+@pytest.mark.slow
+def test_overlapping_bodies_are_refused() -> None:
+    world = World()
+    world.add(prop(), name="box")
+    message = r"king at \(0\.1\d, .*\) overlaps box at \(.*\) by 0\.\d+ m; move one of them"
+    with pytest.raises(UserError, match=message):
+        world.add(prop(), at=(0.15, 0.0), name="king")
+    world.add(prop(), at=(0.6, 0.0), name="king")
+    assert [placed.name for placed in world.members] == ["box", "king"]

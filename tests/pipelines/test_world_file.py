@@ -1,0 +1,45 @@
+"""World files: each mistake is reported with its line, and solids have their stated size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.pipelines.world_file import box, ramp, read_world
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("friction: 0.6\n", "line 1: bodies is missing; give a list of bodies"),
+        ("bodies:\n- capture: a.ply\n  moton: jump\n", r"line 3: bodies.1.moton: unknown key \(did you mean 'motion'"),
+        ("bodies:\n- capture: a.ply\n\n  at: [0, 1, 2]\n", r"line 4: bodies.1.at: '\[0, 1, 2\]' is not valid"),
+        ("bodies:\n- capture: a.ply\n- prop: true\n", "line 3: bodies.2: capture is missing; give the name"),
+        ("bodies:\n- {capture: a.ply, density: 3}\n", "line 2: density is for a prop; add prop: true"),
+        ("bodies:\n- {capture: a.ply, motion: fly}\n", "line 2: .*fly"),
+        ("bodies:\n- {capture: a.ply}\nobstacles:\n- box: {at: [0, 0]}\n", "line 4: obstacles.1.box: size is missing"),
+        ("bodies:\n- {capture: missing.ply}\n", "line 2: .*missing.ply"),
+        ("bodies: [a\n", "not YAML"),
+        ("bodies: []\nbodies: []\n", "occurs twice"),
+    ],
+)
+def test_mistakes_are_reported_with_their_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "world.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError, match=message) as caught:
+        read_world(path, device="cpu")
+    assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
+
+
+def test_a_box_and_a_ramp_have_their_size() -> None:
+    solid = box((1.0, 0.0), (0.4, 0.2, 0.3), heading=90.0)
+    heights = [solid.distance_along(np.array([x, y, 0.0]), UP) for x, y in ((1.0, 0.0), (1.09, 0.19), (1.15, 0.0))]
+    assert heights == pytest.approx([0.3, 0.3, -np.inf])
+    slope = ramp((0.0, 0.0), 2.0, 1.0, 0.5)
+    heights = [slope.distance_along(np.array([x, 0.0, 0.0]), UP) for x in (-0.1, 1.0, 1.9, 2.1)]
+    assert heights == pytest.approx([-0.025, 0.25, 0.475, -np.inf])

@@ -1,0 +1,105 @@
+"""Boxes as bodies of a world: props of one tetrahedron, or soft blocks without muscles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.sparse as sparse
+
+from egs_warp.contact.detection import ContactGeometry
+from egs_warp.deformation.embedding import embed_points
+from egs_warp.fem.affine_body import VolumeMoments, affine_body
+from egs_warp.fem.body import BodyState, make_body
+from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
+from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
+from egs_warp.meshing.level_set import level_set_of_surface
+from egs_warp.muscles.muscle_set import MuscleSet
+from tests.support.meshes import UP, box_mesh
+
+FLOOR = Plane(UP, 0.0)
+
+
+def no_muscles(node_count: int) -> MuscleSet:
+    """Return a set without muscles for a body with ``node_count`` nodes."""
+    none, indices = np.zeros(0), np.zeros(0, np.int32)
+    rows, pairs = sparse.csr_matrix((0, node_count)), np.zeros((0, 2), np.int32)
+    return MuscleSet(rows, pairs, none, none, none, indices, (), (), indices, indices)
+
+
+def surface_grid(size: tuple[float, float, float], count: int = 4) -> np.ndarray:
+    """Return the points (n, 3) m of a grid with ``count`` points along each edge that are on the surface of a box on
+    z = 0."""
+    axes = [np.linspace(-size[0] / 2, size[0] / 2, count), np.linspace(-size[1] / 2, size[1] / 2, count)]
+    axes.append(np.linspace(0.0, size[2], count))
+    indices = np.moveaxis(np.indices((count,) * 3), 0, -1).reshape(-1, 3)
+    on_surface = ((indices == 0) | (indices == count - 1)).any(axis=1)
+    return np.stack([axis[index] for axis, index in zip(axes, indices[on_surface].T, strict=True)], axis=1)
+
+
+def box_body(
+    size: tuple[float, float, float],
+    *,
+    plane: Plane = FLOOR,
+    up: np.ndarray = UP,
+    friction: float = 0.5,
+    soft: bool = False,
+    density: float = 1000.0,
+) -> WorldBody:
+    """Make a box of ``size`` m that stands on z = 0."""
+    shape = box_mesh((2, 2, 2), size)
+    if soft:
+        body = make_body(shape, FLOOR, sag=0.02, device="cpu")
+    else:
+        body = affine_body(VolumeMoments.of_mesh(shape), size[2], up=up, density=density, device="cpu")
+    embedding = embed_points(body.mesh, surface_grid(size), device="cpu")
+    geometry = ContactGeometry(body.mesh, (plane,), friction, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
+    stepper = LocomotionStepper(body, no_muscles(len(body.mesh.nodes)), geometry, device="cpu")
+    level_set = level_set_of_surface(shape.nodes, shape.boundary_faces(), cells=64)
+    return WorldBody(stepper, level_set, body.mesh.nodes)
+
+
+class RunningWorld:
+    """A world without objectives, its states and the reports of its last step."""
+
+    def __init__(
+        self,
+        bodies: Sequence[WorldBody],
+        shifts: Sequence[Sequence[float]],
+        speeds: Sequence[Sequence[float]] = (),
+        frictions: np.ndarray | None = None,
+    ) -> None:
+        self.stepper, self.bodies = WorldStepper(bodies, frictions=frictions), [each.stepper.body for each in bodies]
+        self.states = [
+            BodyState(
+                body.mesh.nodes + np.asarray(shift, float), np.tile(np.asarray(speed, float), (len(body.mesh.nodes), 1))
+            )
+            for body, shift, speed in zip(self.bodies, shifts, speeds or [(0.0, 0.0, 0.0)] * len(bodies), strict=True)
+        ]
+        self.memories, self.min_gap = self.stepper.initial_memories(), np.inf
+        self.reports: list[list[StepReport]] = []
+
+    def advance(self, dt: float) -> None:
+        """Advance one step of ``dt`` s."""
+        self.reports = self.stepper.advance(self.states, self.memories, [()] * len(self.states), dt)
+        assert all(report.converged for reports in self.reports for report in reports)
+        self.states = [reports[-1].state for reports in self.reports]
+        self.memories = [WarmStart.from_report(reports[-1]) for reports in self.reports]
+        self.min_gap = min([self.min_gap, *(report.min_gap for reports in self.reports for report in reports)])
+
+    def centres(self) -> np.ndarray:
+        """Return the centres of mass (k, 3) m."""
+        parts = zip(self.bodies, self.states, strict=True)
+        return np.array([body.centre_of_mass(state.positions) for body, state in parts])
+
+    def momenta(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the linear momentum (3,) kg m/s of the world, and the angular momentum (3,) kg m^2/s about the
+        origin."""
+        parts = [
+            (body.node_mass[:, None], s.positions, s.velocities)
+            for body, s in zip(self.bodies, self.states, strict=True)
+        ]
+        linear = sum((mass * velocities).sum(axis=0) for mass, _, velocities in parts)
+        angular = sum((mass * np.cross(positions, velocities)).sum(axis=0) for mass, positions, velocities in parts)
+        return np.asarray(linear), np.asarray(angular)
