@@ -14,7 +14,7 @@ import egs_warp.kernels.fem
 import egs_warp.kernels.locomotion
 
 PACKAGES = (egs_warp.kernels.contact, egs_warp.kernels.fem, egs_warp.kernels.locomotion)
-ONLY_CPU = {"egs_warp.kernels.fem.supernodal"}
+ONLY_CPU = {"egs_warp.kernels.fem.quadratic_form", "egs_warp.kernels.fem.supernodal"}
 """Modules whose kernels are launched on a CPU only and do not compile for a GPU."""
 ARCHITECTURE = 90
 """Compute capability 9.0: H100 and H200."""

@@ -237,6 +237,7 @@ def run_animate(args: argparse.Namespace) -> int:
 
 def _animate_capture(args: argparse.Namespace) -> Report:
     """Animate a capture that contains only the object."""
+    from egs_warp.commands.scene_hint import scene_notes
     from egs_warp.commands.scene_input import ground_of, light_of, plane_of
     from egs_warp.io import read_capture
     from egs_warp.io.video import ffmpeg_program
@@ -257,6 +258,7 @@ def _animate_capture(args: argparse.Namespace) -> Report:
     if plane is None and up is None:
         up, note = guessed_up(capture)
         notes = (*notes, note)
+    notes = (*notes, *scene_notes(capture.cloud, plane.normal if plane is not None else up))
     options = replace(
         options,
         shot=shot,

@@ -44,6 +44,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def _info(args: argparse.Namespace) -> int:
+    from egs_warp.commands.scene_hint import scene_notes
     from egs_warp.commands.scene_input import plane_of, read_scene
     from egs_warp.errors import UserError
     from egs_warp.io import read_capture
@@ -72,6 +73,7 @@ def _info(args: argparse.Namespace) -> int:
         if plane is None and up is None:
             up, note = guessed_up(capture)
             notes = (*notes, note)
+        notes = (*notes, *scene_notes(cloud, plane.normal if plane is not None else up))
     with info_bar() as begins:
         info = inspect_capture(
             cloud,

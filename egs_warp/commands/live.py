@@ -146,6 +146,7 @@ class _Source:
 
 def _read_capture(args: argparse.Namespace) -> _Source:
     """Read a capture that contains only the object."""
+    from egs_warp.commands.scene_hint import scene_notes
     from egs_warp.commands.scene_input import ground_of, light_of, plane_of
     from egs_warp.io import read_capture
 
@@ -159,6 +160,8 @@ def _read_capture(args: argparse.Namespace) -> _Source:
         print_note(note)
     if plane is None and up is None:
         up, note = guessed_up(capture)
+        print_note(note)
+    for note in scene_notes(capture.cloud, plane.normal if plane is not None else up):
         print_note(note)
     front = parse_direction("front", args.front) if args.front is not None else None
     behind = background.cloud_aligned_with(capture) if background is not None else None

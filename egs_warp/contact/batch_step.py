@@ -42,7 +42,7 @@ def no_timer(name: str) -> AbstractContextManager[object]:
 class BatchLinearization(BatchedRecord):
     """``ContactLinearization`` of c worlds. Their factored tangents stay in the slots of the ``BatchProblem``."""
 
-    momentum_projection: MomentumProjection
+    momentum_projection: MomentumProjection[torch.Tensor]
     columns: torch.Tensor
     """(c, 3N, 3K) m/s per newton, dt J^-1 W^T."""
     delassus: torch.Tensor
@@ -117,7 +117,10 @@ class BatchSolver(NewtonOptions):
     """Timer of the stages of a step."""
 
     def linearize(
-        self, problem: BatchProblem, contacts: ContactSet, momentum_projection: MomentumProjection | None = None
+        self,
+        problem: BatchProblem,
+        contacts: ContactSet,
+        momentum_projection: MomentumProjection[torch.Tensor] | None = None,
     ) -> BatchLinearization:
         """Linearise ``contacts`` with the tangents in the worlds' slots of ``problem``. The momentum projection is
         computed unless it is passed.
@@ -321,7 +324,7 @@ def _judge(progress: torch.Tensor, sizes: torch.Tensor, violations: torch.Tensor
     """Judge the trials of c worlds (see ``NewtonProgress.judge``); ``progress`` (c, ROW_SIZE) is updated in place."""
     running = torch.empty(len(sizes), dtype=torch.int32, device=sizes.device)
     launch_on(
-        sizes.device,
+        sizes,
         rule.judge_steps_kernel,
         len(sizes),
         inputs=[torch.inf, (sizes, real), (violations, real), (torch.zeros_like(sizes), real)],

@@ -8,15 +8,20 @@ this continuation.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import warp as wp
 
-from egs_warp.fem.batched import contiguous, empty_like, launch_on, nonzero
+from egs_warp.fem.batched import ArrayT, contiguous, empty_like, launch_on, nonzero
 from egs_warp.kernels.contact import coulomb as kernels
 from egs_warp.launching import thread_local_cache
 from egs_warp.precision import Vec4, real
+
+if TYPE_CHECKING:
+    import torch
+
+_Residual = TypeVar("_Residual")
 
 TOLERANCE, MAX_ITERATIONS = 1e-12, 16
 """Residual of the projection equations, m/s, at which Newton's method ends, and its maximum number of steps."""
@@ -34,7 +39,9 @@ are more points than the cage can resolve.
 """
 
 
-def regularized(delassus: Any, fraction: float, counts: Any = None, out: Any = None) -> Any:
+def regularized(
+    delassus: ArrayT, fraction: float, counts: torch.Tensor | None = None, out: ArrayT | None = None
+) -> ArrayT:
     """Return the operator with ``fraction`` of its mean diagonal entry added to its diagonal.
 
     Args:
@@ -54,17 +61,19 @@ def regularized(delassus: Any, fraction: float, counts: Any = None, out: Any = N
 
 
 def _continue_from_compliance(
-    solve: Callable[[Any, Any], tuple[Any, Any]], delassus: Any, forces: Any, counts: Any = None
-) -> tuple[Any, Any]:
+    solve: Callable[[ArrayT, ArrayT], tuple[ArrayT, _Residual]],
+    delassus: ArrayT,
+    forces: ArrayT,
+    counts: torch.Tensor | None = None,
+) -> tuple[ArrayT, _Residual]:
     """Solve with less and less compliant contacts, starting from ``forces``.
 
     ``solve`` maps an operator and initial forces to forces and their residual. Return the forces and the residual for
     ``delassus`` itself, without compliance.
     """
-    residual = None
-    for softness in (*REGULARIZATION_STEPS, 0.0):
-        forces, residual = solve(regularized(delassus, softness, counts), forces)
-    return forces, residual
+    for softness in REGULARIZATION_STEPS:
+        forces, _ = solve(regularized(delassus, softness, counts), forces)
+    return solve(delassus, forces)
 
 
 def coulomb_forces(
@@ -73,9 +82,6 @@ def coulomb_forces(
     shift: np.ndarray,
     friction: float,
     start: np.ndarray,
-    *,
-    tolerance: float = TOLERANCE,
-    iteration_limit: int = MAX_ITERATIONS,
 ) -> tuple[np.ndarray, float]:
     """Compute contact forces f (n, 3) with exact Coulomb friction and complementary f_n >= 0 and u_n + shift >= 0,
     where u = free_velocity + G f (Eq. 8, 9).
@@ -89,8 +95,6 @@ def coulomb_forces(
         shift: (n,) m/s, bias of the normal velocities.
         friction: Coulomb coefficient mu.
         start: (n, 3) newtons, initial forces.
-        tolerance: residual at which Newton's method ends, m/s.
-        iteration_limit: maximum number of Newton steps of the first attempt.
 
     Returns:
         The forces (n, 3) in newtons and the residual in m/s.
@@ -98,7 +102,7 @@ def coulomb_forces(
     count = len(shift)
     if count == 0:
         return start, 0.0
-    workspace = _workspace(count, tolerance, iteration_limit)
+    workspace = _workspace(count)
     result, residual = workspace.solve(delassus, free_velocity, shift, friction, start)
     if residual <= FAILURE_TOLERANCE:
         return result, residual
@@ -113,7 +117,7 @@ class _CoulombWorkspace:
     as solving for ten contacts.
     """
 
-    def __init__(self, count: int, tolerance: float, iteration_limit: int) -> None:
+    def __init__(self, count: int) -> None:
         size = 3 * count
         self._delassus, self._free, self._shifts = np.zeros((1, size, size)), np.zeros((1, size)), np.zeros((1, count))
         self._friction, self._forces, self._residual = np.zeros(1), np.zeros((1, size)), np.zeros(1)
@@ -124,7 +128,7 @@ class _CoulombWorkspace:
         self._launch: Any = wp.launch(
             kernels.coulomb_kernel,
             dim=(1, 1),
-            inputs=[counts, *values, tolerance, iteration_limit, _shared(self._forces), *scratch],
+            inputs=[counts, *values, TOLERANCE, MAX_ITERATIONS, _shared(self._forces), *scratch],
             outputs=[_shared(self._residual)],
             device="cpu",
             record_cmd=True,
@@ -144,13 +148,13 @@ _workspace = thread_local_cache(32)(_CoulombWorkspace)
 
 
 def coulomb_forces_of_worlds(
-    counts: Any,
-    delassus: Any,
-    free_velocity: Any,
-    shift: Any,
-    frictions: Any,
-    start: Any,
-) -> tuple[Any, Any]:
+    counts: torch.Tensor,
+    delassus: torch.Tensor,
+    free_velocity: torch.Tensor,
+    shift: torch.Tensor,
+    frictions: torch.Tensor,
+    start: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Compute the Coulomb forces of c worlds on tensors, by the method of ``coulomb_forces``.
 
     Args:
@@ -183,13 +187,13 @@ def coulomb_forces_of_worlds(
 
 
 def _solve_worlds(
-    counts: Any,
-    delassus: Any,
-    free_velocity: Any,
-    shift: Any,
-    frictions: Any,
-    start: Any,
-) -> tuple[Any, Any]:
+    counts: torch.Tensor,
+    delassus: torch.Tensor,
+    free_velocity: torch.Tensor,
+    shift: torch.Tensor,
+    frictions: torch.Tensor,
+    start: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Compute the forces with the kernel alone, without continuation (arguments as in ``coulomb_forces_of_worlds``)."""
     worlds, capacity, _ = start.shape
     forces, residual, size = start.clone(), start.new_zeros(worlds), 3 * capacity
@@ -202,11 +206,11 @@ def _solve_worlds(
 
 
 def enqueue_forces(
-    counts: Any,
-    values: tuple[Any, ...],
-    forces: Any,
-    scratch: tuple[Any, Any, Any],
-    residual: Any,
+    counts: torch.Tensor,
+    values: tuple[torch.Tensor, ...],
+    forces: torch.Tensor,
+    scratch: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    residual: torch.Tensor,
 ) -> None:
     """Queue the kernel for c worlds with contiguous arrays.
 
@@ -221,7 +225,7 @@ def enqueue_forces(
     vectors, indices, matrices = scratch
     lanes = kernels.BLOCK if forces.is_cuda else 1
     launch_on(
-        forces.device,
+        forces,
         kernels.coulomb_kernel,
         (len(forces), lanes),
         inputs=[

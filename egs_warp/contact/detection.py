@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -33,6 +33,9 @@ from egs_warp.kernels.contact.contacts import contact_record_kernel
 from egs_warp.kernels.contact.height_field import ground_gaps_kernel
 from egs_warp.launching import PinnedMirror, copy_into, grow_capacity, launch_cached, zeros
 from egs_warp.precision import Mat33, Vec3, Vec4, real
+
+if TYPE_CHECKING:
+    import torch
 
 MIN_OUTSIDE_FRACTION = 0.1
 """Minimum fraction of the Gaussians above the ground that must lie outside all solids at rest."""
@@ -325,7 +328,7 @@ class ContactDetector:
             device=self.device,
         )
 
-    def gaps_of_worlds(self, positions: Any) -> tuple[Any, Any]:
+    def gaps_of_worlds(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Evaluate the gaps of all points in c worlds, whose ``positions`` (c, N, 3) m are a tensor on the device.
 
         Returns:
@@ -337,7 +340,9 @@ class ContactDetector:
             self.enqueue_gaps(as_warp(positions.contiguous(), Vec3), as_warp(gaps, real), as_warp(faces, wp.int32))
         return gaps, faces
 
-    def contact_sets(self, points: Any, counts: Any, positions: Any, start: Sequence[Any]) -> ContactSet:
+    def contact_sets(
+        self, points: torch.Tensor, counts: torch.Tensor, positions: torch.Tensor, start: Sequence[torch.Tensor]
+    ) -> ContactSet:
         """Return the contacts of c worlds as tensors on the device. Blocks until ``counts`` is known on the host.
 
         Args:

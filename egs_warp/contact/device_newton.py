@@ -14,11 +14,12 @@ from functools import cached_property
 import numpy as np
 
 from egs_warp.contact.contact_set import ContactSet
-from egs_warp.contact.device_newton_workspace import FROM_BASE, FROM_TRIAL, NewtonWorkspace, TrialReadback
+from egs_warp.contact.device_newton_workspace import FROM_BASE, FROM_TRIAL, NewtonWorkspace
 from egs_warp.contact.device_step import SolveEnd, StepWorkspace
 from egs_warp.contact.newton import ContactLinearization, ContactLinearizer, NewtonStepResult, PenetrationCheck
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.contact.prefetch import ContactPrefetch
+from egs_warp.contact.trial_readback import TrialReadback
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.step_problem import Tangent
@@ -148,7 +149,7 @@ class DeviceContactLinearization(ContactLinearization):
         return workspace.trial_iterate
 
     def parse_iterate(
-        self, tension: MuscleEnergy | None, forces: np.ndarray, readback: TrialReadback
+        self, tension: MuscleEnergy | None, forces: np.ndarray, readback: TrialReadback[np.ndarray]
     ) -> DeviceNewtonIterate:
         """Create an iterate from the read-back of a trial."""
         return self.iterate(
@@ -160,7 +161,7 @@ class DeviceContactLinearization(ContactLinearization):
             self.parse_penetration(readback),
         )
 
-    def parse_penetration(self, readback: TrialReadback) -> PenetrationCheck | None:
+    def parse_penetration(self, readback: TrialReadback[np.ndarray]) -> PenetrationCheck | None:
         """Return the penetration test in the read-back; None if the gaps at the start of the step were not
         evaluated.
         """

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from egs_warp.contact.device_coulomb import CoulombWorkspace
 from egs_warp.contact.device_step import StepWorkspace, vectors
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.contact.trial import NewtonDirection, Trial, TrialStep, enqueue_trial
+from egs_warp.contact.trial_readback import ReadbackBuffers, TrialReadback
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
 from egs_warp.fem.step_problem import StepProblem
@@ -39,31 +40,6 @@ FROM_BASE, FROM_TRIAL, FROM_START = 0.0, 1.0, 2.0
 """Slot that a trial starts from: the unchanged base, the last trial, or the start buffer."""
 _FULL_STEP = (1.0, 1.0, FROM_TRIAL)
 """Packed input of a full Newton step from the last trial: step length, 1 if contact forces act (else 0), slot."""
-
-
-class TrialReadback(NamedTuple):
-    """Read-back of a trial. The next trial overwrites the memory."""
-
-    residual_norm: np.ndarray
-    """(1,) N s, norm of the residual; not finite where an element is inverted."""
-    free_contact_velocities: np.ndarray
-    """(3K,) m/s, contact velocities after a Newton step from the trial without contact forces."""
-    velocities: np.ndarray
-    """(3N,) m/s, velocities of the trial."""
-    coulomb_violation: np.ndarray
-    """(1,) m/s, residual of the last Coulomb solve."""
-    forces: np.ndarray
-    """(3K,) newtons, contact forces of the last Coulomb solve."""
-    penetration: np.ndarray
-    """(5,), packed ``PenetrationCheck``."""
-    progress: np.ndarray
-    """(ROW_SIZE,) row of ``NewtonProgress`` after the loop."""
-    previous_contact_velocities: np.ndarray
-    """(3K,) m/s, ``free_contact_velocities`` of the iterate at the start of the last step."""
-    velocities_before: np.ndarray
-    """(3N,) m/s, velocities of that iterate."""
-    forces_before: np.ndarray
-    """(3K,) newtons, contact forces of that iterate."""
 
 
 class NewtonWorkspace:
@@ -93,19 +69,14 @@ class NewtonWorkspace:
         """(3,) length of the step, 1 if contact forces act (else 0), slot to start from. ``target_forces`` (3K,)
         newtons.
         """
-        parts = [1, width, size, 1, width, 5, convergence_kernels.ROW_SIZE, width, size, width]
-        self._packed_readback, self._host_readback = owner.zeros(sum(parts)), owner.stream.pinned(sum(parts))
-        (
-            self.residual_norm,
-            self.free_contact_velocities,
-            self.velocities,
-            self.coulomb_violation,
-            self._solved_forces,
-            *others,
-        ) = self._packed_readback.split(parts)
-        penetration, self._progress, self._previous_contact_velocities, *self._previous_iterate = others
-        self._penetrating_count, self._min_gap, self._internal_torque = penetration.split([1, 1, 3])
-        self.readback = TrialReadback(*np.split(self._host_readback.numpy(), np.cumsum(parts)[:-1]))
+        self._readback = ReadbackBuffers(owner.stream, capacity, self._node_count)
+        self.readback, on_device = self._readback.on_host, self._readback.on_device
+        self.residual_norm, self.velocities = on_device.residual_norm, on_device.velocities
+        self.free_contact_velocities, self.coulomb_violation = (
+            on_device.free_contact_velocities,
+            on_device.coulomb_violation,
+        )
+        self._penetrating_count, self._min_gap, self._internal_torque = on_device.penetration.split([1, 1, 3])
         # State of the Newton loop: row of progress, loop condition, event at the end.
         self._progress_upload = PinnedUpload(owner.stream, convergence_kernels.ROW_SIZE)
         self._loop_condition, self._always_enabled = (
@@ -140,7 +111,7 @@ class NewtonWorkspace:
         self.started = np.zeros(0)
         """(ROW_SIZE,) row of progress with which the last loop was started."""
 
-    def trial_parts(self) -> Any:
+    def trial_parts(self) -> tuple[torch.Tensor, ...]:
         """Return the last trial, split as in ``parts``."""
         return self.parts(self._trial)
 
@@ -215,10 +186,10 @@ class NewtonWorkspace:
         self.coulomb.enqueue_operator(self.delassus)
         self._host_delassus.copy_(self.delassus.view(-1), non_blocking=True)
 
-    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
+    def _launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self._device)
 
-    def parts(self, state: torch.Tensor) -> Any:
+    def parts(self, state: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Split an iterate into velocities (3N,), velocities after a Newton step without contact forces (3N,),
         residual without contact forces (3N,) and forces (3K,).
         """
@@ -243,7 +214,7 @@ class NewtonWorkspace:
 
     def run_trial(
         self, problem: StepProblem, *, length: float, target_forces: np.ndarray, base: float
-    ) -> TrialReadback:
+    ) -> TrialReadback[np.ndarray]:
         """Evaluate a trial and block until it is evaluated.
 
         Args:
@@ -290,7 +261,7 @@ class NewtonWorkspace:
             self._run(self._enqueue_end, dt)
             self._newton_event = self.owner.stream.record_event(self._newton_event)
 
-    def wait_newton(self) -> TrialReadback:
+    def wait_newton(self) -> TrialReadback[np.ndarray]:
         """Block for the result of ``start_newton``."""
         if self._newton_event is not None:
             self._newton_event.synchronize()
@@ -299,7 +270,7 @@ class NewtonWorkspace:
     def _enqueue_loop_start(self, base: float, enabled: torch.Tensor) -> None:
         if base == FROM_BASE:
             self._trial.copy_(self._base)
-        self._progress.copy_(self._progress_upload.device)
+        self._readback.on_device.progress.copy_(self._progress_upload.device)
         self._launch(
             convergence_kernels.begin_loop_kernel,
             1,
@@ -310,12 +281,12 @@ class NewtonWorkspace:
 
     def _loop_state(self) -> list[wp.array]:
         """Return the progress and the loop condition, which both kernels of the loop write."""
-        return [as_warp(self._progress[None], real), as_warp(self._loop_condition, wp.int32)]
+        return [as_warp(self._readback.on_device.progress[None], real), as_warp(self._loop_condition, wp.int32)]
 
     def _enqueue_next_step(self, dt: float, ratio: float) -> None:
         """Enqueue a Newton step from the last trial and an update of the loop condition."""
         self.target_forces.copy_(self.trial_parts()[3])
-        self._previous_contact_velocities.copy_(self.free_contact_velocities)
+        self._readback.on_device.previous_contact_velocities.copy_(self.free_contact_velocities)
         self.enqueue_newton(dt, ratio)
         self._enqueue_penetration()
         self._launch(
@@ -336,12 +307,13 @@ class NewtonWorkspace:
         read-back.
         """
         velocities, _, _, forces = self.parts(self._base)
-        for target, value in zip(self._previous_iterate, (velocities, forces), strict=True):
-            target.copy_(value)
+        on_device = self._readback.on_device
+        on_device.velocities_before.copy_(velocities)
+        on_device.forces_before.copy_(forces)
         self._download_rest()
-        before = self._points, self.coulomb.counts, self._solved_forces[::3]
+        before = self._points, self.coulomb.counts, on_device.forces[::3]
         self.owner.enqueue_prefetch(self.end_positions, self.velocities, dt, *before)
-        self._start_download()
+        self._readback.start_download()
 
     def _enqueue_penetration(self) -> None:
         """Count the points that penetrate too far at the end of the last trial."""
@@ -359,7 +331,7 @@ class NewtonWorkspace:
         with the solution.
         """
         self.coulomb.enqueue_forces(self.free_contact_velocities, self.target_forces, self.coulomb_violation)
-        self._solved_forces.copy_(self.target_forces)
+        self._readback.on_device.forces.copy_(self.target_forces)
         self.enqueue_trial(dt, ratio)
 
     def _upload_trial(self, length: float, use_forces: bool, target_forces: np.ndarray, base: float) -> None:
@@ -412,9 +384,9 @@ class NewtonWorkspace:
     def _enqueue_refactor(self, dt: float, ratio: float) -> None:
         self.enqueue_linearization(dt, ratio)
         self._enqueue_newton(self._base)
-        self._start_download()
+        self._readback.start_download()
 
-    def _run_and_download(self, work: Callable[..., None], *args: float) -> TrialReadback:
+    def _run_and_download(self, work: Callable[..., None], *args: float) -> TrialReadback[np.ndarray]:
         with self.owner.stream:
             self._run(work, *args)
             self.owner.stream.wait()
@@ -432,11 +404,7 @@ class NewtonWorkspace:
         self._trial_upload.send()
         self._enqueue_base()
         self._enqueue_newton(self._base)
-        self._start_download()
-
-    def _start_download(self) -> None:
-        """Start the download of the read-back."""
-        self._host_readback.copy_(self._packed_readback, non_blocking=True)
+        self._readback.start_download()
 
     def _enqueue_newton(self, state: torch.Tensor) -> None:
         """Compute the nodal velocities after a Newton step without contact forces from ``state``, and the contact
@@ -471,7 +439,7 @@ class NewtonWorkspace:
     def _enqueue_predict(self, dt: float, ratio: float) -> None:
         self._trial_upload.send()
         self.enqueue_prediction(dt, ratio)
-        self._start_download()
+        self._readback.start_download()
 
     def enqueue_prediction(self, dt: float, ratio: float) -> None:
         """Queue the Newton step of ``predict_velocities`` from the trial that ``trial_input`` describes. ``ratio`` is 1
@@ -495,7 +463,7 @@ class NewtonWorkspace:
         self.enqueue_trial(dt, ratio)
         self._enqueue_penetration()
         self._download_rest()
-        self._start_download()
+        self._readback.start_download()
 
     def enqueue_trial(self, dt: float, ratio: float) -> None:
         """Evaluate the trial that ``trial_input`` describes: its residual, and the Newton step from it without contact

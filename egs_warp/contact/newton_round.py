@@ -11,27 +11,30 @@ world on the host or on a GPU, ``batch_step`` for many worlds.
 from __future__ import annotations
 
 from collections.abc import Sized
-from typing import Any, Protocol
+from typing import Protocol, TypeVar
 
 from egs_warp.kernels.contact.newton_convergence import ENDED, FAILED, NEAR_END, NEEDS_TANGENT, SHORTEN
 
+WorldsT = TypeVar("WorldsT", bound=Sized)
+"""Type of a set of worlds, for example a tensor of their indices."""
 
-class NewtonWorlds(Protocol):
+
+class NewtonWorlds(Protocol[WorldsT]):
     """Worlds that run one round together. Arguments named ``worlds`` are results of ``running`` or ``active``."""
 
-    def running(self) -> Sized:
+    def running(self) -> WorldsT:
         """Return the active worlds that have steps left."""
         ...
 
-    def active(self, bits: int) -> Sized:
+    def active(self, bits: int) -> WorldsT:
         """Return the active worlds whose last trial had any of ``bits`` as its outcome."""
         ...
 
-    def take_step(self, worlds: Any) -> None:
+    def take_step(self, worlds: WorldsT) -> None:
         """Take a full Newton step in each of the ``worlds``, judge its trial, and make it the iterate if accepted."""
         ...
 
-    def halve_step(self, worlds: Any) -> None:
+    def halve_step(self, worlds: WorldsT) -> None:
         """Judge the trial at the reduced length of the last Newton step in each of the ``worlds``."""
         ...
 
@@ -39,18 +42,18 @@ class NewtonWorlds(Protocol):
         """End the round of the worlds whose last trial had any of ``bits`` as its outcome."""
         ...
 
-    def check_penetration(self, worlds: Any) -> None:
+    def check_penetration(self, worlds: WorldsT) -> None:
         """End the round of each of the ``worlds`` whose contacts must be extended by penetrating points."""
         ...
 
-    def renew_tangent(self, worlds: Any) -> None:
+    def renew_tangent(self, worlds: WorldsT) -> None:
         """Factor the tangents of the ``worlds`` at their velocities and linearise their contacts. End the round of
         worlds whose tangent cannot be factored.
         """
         ...
 
 
-def run_round(newton: NewtonWorlds) -> None:
+def run_round(newton: NewtonWorlds[WorldsT]) -> None:
     """Iterate until the round of every world has ended."""
     while len(worlds := newton.running()) > 0:
         newton.take_step(worlds)

@@ -74,6 +74,7 @@ class PairContactDetector:
         """(nbody + 1,) first node of each body, and the number of all nodes."""
         self.point_starts = np.concatenate([[0], np.cumsum(points)]).astype(int)
         """(nbody + 1,) first contact point of each body, and the number P of all points."""
+        self._box_weights = [_box_weights(body) for body in bodies]
 
     def numbers(self, body: int | np.ndarray, points: np.ndarray, other: int | np.ndarray) -> np.ndarray:
         """Return the numbers (n,) of the contacts of ``points`` (n,) of ``body`` with the body ``other``, or with the
@@ -92,11 +93,9 @@ class PairContactDetector:
         and (b, a), in ascending order.
         """
         boxes = []
-        for body, part in zip(self.bodies, self._split(positions), strict=True):
+        for body, weights, part in zip(self.bodies, self._box_weights, self._split(positions), strict=True):
             # The cage encloses the body, but the tetrahedron of a prop does not.
-            corners = (
-                part if len(body.geometry.mesh.tets) > 1 else body.geometry.weights @ part[body.geometry.mesh.tets[0]]
-            )
+            corners = part if weights is None else weights @ part
             margin = BODY_INFLATION * body.selector.activation_distance
             boxes.append((corners.min(axis=0) - margin, corners.max(axis=0) + margin))
         lows, highs = (np.array(each).reshape(-1, 3) for each in zip(*boxes, strict=True))
@@ -142,9 +141,9 @@ class PairContactDetector:
         """
         keys, found = self.keys(contacts), [np.zeros(0, int)]
         for a, b in self.body_pairs(end):
-            # The gaps at the end come last, because the record extrapolates in the tetrahedra that they find.
-            start_gaps, end_gaps = self.gaps(a, b, start), self.gaps(a, b, end)
-            if end_gaps.min() < -ACTIVATION_DEPTH * tolerance:
+            if self.gaps(a, b, end).min() < -ACTIVATION_DEPTH * tolerance:
+                # The gaps at the end come last, because the record extrapolates in the tetrahedra that they find.
+                start_gaps, end_gaps = self.gaps(a, b, start), self.gaps(a, b, end)
                 own = keys[(keys[:, 0] == a) & (keys[:, 1] == b), 2]
                 points = self.bodies[a].selector.find_penetrating(own, end_gaps, start_gaps, tolerance)
                 found.append(self.numbers(a, points, b))
@@ -222,6 +221,20 @@ class PairContactDetector:
         nodes, weights, other_nodes, other_weights, axes, gaps = (each.numpy()[0] for each in outputs)
         both = np.hstack([nodes + self.node_starts[a], other_nodes + self.node_starts[b]]).astype(np.int32)
         return both, np.hstack([weights, -other_weights]), axes, gaps
+
+
+def _box_weights(body: PairBody) -> np.ndarray | None:
+    """Return the barycentric weights (8, 4) of the corners of the box around the contact points of a prop at rest; None
+    for a cage of several tetrahedra."""
+    mesh, weights = body.geometry.mesh, body.geometry.weights
+    if len(mesh.tets) > 1:
+        return None
+    nodes = mesh.nodes[mesh.tets[0]]
+    points = weights @ nodes
+    low, high = points.min(axis=0), points.max(axis=0)
+    corners = np.where(np.indices((2, 2, 2)).reshape(3, -1).T == 0, low, high)
+    matrix = np.vstack([nodes.T, np.ones(4)])
+    return np.linalg.solve(matrix, np.vstack([corners.T, np.ones(8)])).T
 
 
 class _DeformedBody:

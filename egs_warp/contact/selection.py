@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -16,6 +16,9 @@ from egs_warp.geometry.tetmesh import mean_edge_length
 from egs_warp.kernels.contact import selection as kernels
 from egs_warp.launching import PinnedMirror, copy_into, grow_capacity, launch_cached, zeros
 from egs_warp.precision import real
+
+if TYPE_CHECKING:
+    import torch
 
 MAX_CELLS_AT_REST = 32
 """Maximum number of cells that touch the ground at rest. The cage cannot resolve more forces than it has nodes
@@ -202,7 +205,9 @@ class ContactSelector:
             self._buffers = _SelectionBuffers(self, grow_capacity(count))
         return self._buffers
 
-    def select_in_worlds(self, previous: Sequence[Any], gaps: Any) -> tuple[Any, Any]:
+    def select_in_worlds(
+        self, previous: Sequence[torch.Tensor], gaps: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Select the points of the next step in c worlds; all arrays are tensors on the device.
 
         Args:
@@ -221,7 +226,9 @@ class ContactSelector:
             self.enqueue_selection(_arrays(wp.int32, *previous), as_warp(gaps, real), work, selected)
         return points, counts
 
-    def find_penetrating_in_worlds(self, contacts: ContactSet, gaps: Sequence[Any], tolerance: float) -> Any:
+    def find_penetrating_in_worlds(
+        self, contacts: ContactSet, gaps: Sequence[torch.Tensor], tolerance: float
+    ) -> torch.Tensor:
         """Find the points that would be too deep at the end of a step and are not contacts, in c worlds.
 
         Args:
@@ -239,7 +246,9 @@ class ContactSelector:
             self.enqueue_penetrating(*inputs, tolerance, [*_arrays(real, found), *_arrays(wp.int32, lowest)])
         return lowest
 
-    def append_in_worlds(self, contacts: ContactSet, lowest: Any, gaps: Any) -> tuple[Any, Any]:
+    def append_in_worlds(
+        self, contacts: ContactSet, lowest: torch.Tensor, gaps: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Append points to the contacts of c >= 1 worlds, in ascending order of their gaps.
 
         Args:
@@ -256,7 +265,7 @@ class ContactSelector:
         return points, counts
 
 
-def _arrays(kind: Any, *tensors: Any) -> list[wp.array]:
+def _arrays(kind: type, *tensors: torch.Tensor) -> list[wp.array]:
     """Return Warp arrays that share the memory of the ``tensors``, or of copies of those that are not contiguous."""
     return [as_warp(each.contiguous(), kind) for each in tensors]
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 
@@ -28,8 +27,8 @@ class TrialStep:
     """Step size, s."""
     inertia_ratio: float
     """1 + dt drag."""
-    gravity: Any
-    """Vec3, m/s^2."""
+    gravity: Vec3
+    """m/s^2, gravitational acceleration."""
     node_mass: torch.Tensor
     """(N,) kg, lumped masses."""
     positions: torch.Tensor

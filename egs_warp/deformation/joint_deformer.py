@@ -17,16 +17,19 @@ class JointDeformer:
     """Deformer of the clouds of several bodies, each with its own cage, into one cloud. Colour bands that only some of
     the clouds have are zero for the others."""
 
-    def __init__(self, deformers: Sequence[Deformer]) -> None:
+    def __init__(self, deformers: Sequence[Deformer], *, fixed: GaussianCloud | None = None) -> None:
+        """Join the clouds of ``deformers`` and, after them, the cloud ``fixed``, which does not move."""
         self._deformers = tuple(deformers)
-        degree = max(deformer.rest.sh_degree for deformer in deformers)
-        self.rest = concatenate(*(_with_bands(deformer.rest, degree) for deformer in deformers))
+        clouds = [*(deformer.rest for deformer in deformers), *([] if fixed is None else [fixed])]
+        degree = max(cloud.sh_degree for cloud in clouds)
+        self.rest = concatenate(*(_with_bands(cloud, degree) for cloud in clouds))
         """All Gaussians, each in the frame of its own cage."""
         rest = self.rest
         self._deformed = DeformedGaussians(
             replace(rest, **{name: wp.clone(getattr(rest, name)) for name in ARRAYS if name != "opacity_logits"}),
             rotations=empty(rest.count, wp.vec4, rest.device),
         )
+        self._deformed.rotations.fill_(wp.vec4(1.0, 0.0, 0.0, 0.0))
 
     def deform(self, poses: Sequence[np.ndarray]) -> DeformedGaussians:
         """Deform all bodies; ``poses`` are the node positions (N, 3) m of each. The next call overwrites the result."""

@@ -56,7 +56,7 @@ class BatchBody:
         )
         self.segments = MuscleSegmentMaps(muscles.difference_rows, muscles.rest_lengths, assembly.device, worlds=count)
         self.mass = torch.as_tensor(body.node_mass, device=self.device)
-        self.gravity, self._difference_rows, self._rest_lengths = (
+        self.gravity, self.difference_rows, self._rest_lengths = (
             torch.as_tensor(np.asarray(values, dtype=np.float64), device=self.device)
             for values in (body.gravity, muscles.difference_rows.toarray(), muscles.rest_lengths)
         )
@@ -79,7 +79,7 @@ class BatchBody:
             tensions: (c, M) N, muscle tensions.
             factor: s^2, multiplies the Hessian.
         """
-        rows, rest_lengths = self._difference_rows, self._rest_lengths
+        rows, rest_lengths = self.difference_rows, self._rest_lengths
         vectors = rows @ positions
         lengths = vectors.norm(dim=2).clamp(min=_MIN_LENGTH)
         directions = vectors / lengths[:, :, None]
@@ -99,7 +99,7 @@ class BatchBody:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BatchProblem(ImplicitStep):
+class BatchProblem(ImplicitStep[torch.Tensor]):
     """The implicit steps of c worlds, with tensors on the device of the body."""
 
     worlds: BatchBody
@@ -272,8 +272,8 @@ def enqueue_step_start(
 
 
 def apply_inverse(
-    problem: BatchProblem, impulses: torch.Tensor, projection: MomentumProjection | None = None
-) -> tuple[torch.Tensor, MomentumProjection]:
+    problem: BatchProblem, impulses: torch.Tensor, projection: MomentumProjection[torch.Tensor] | None = None
+) -> tuple[torch.Tensor, MomentumProjection[torch.Tensor]]:
     """Return the velocity changes J^-1 ``impulses`` and the momentum projection that was used.
 
     Args:

@@ -7,8 +7,10 @@ PyTorch is not imported here, so that it is not required for one world on a CPU.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Self
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
 
 import numpy as np
 import warp as wp
@@ -17,6 +19,11 @@ from egs_warp.launching import launch_cached
 
 if TYPE_CHECKING:
     import torch
+
+Array: TypeAlias = "np.ndarray | torch.Tensor"
+"""A NumPy array or a PyTorch tensor."""
+ArrayT = TypeVar("ArrayT", "np.ndarray", "torch.Tensor")
+"""Type of the arrays of a record or a function: either all are NumPy arrays, or all are PyTorch tensors."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,7 @@ class BatchedRecord:
         return [(name, value) for name, value in values if isinstance(value, BatchedRecord) or hasattr(value, "ndim")]
 
 
-def _rows(value: Any, worlds: torch.Tensor) -> Any:
+def _rows(value: BatchedRecord | torch.Tensor, worlds: torch.Tensor) -> BatchedRecord | torch.Tensor:
     return value.gather(worlds) if isinstance(value, BatchedRecord) else value[worlds]
 
 
@@ -64,7 +71,7 @@ def _rows_on_host(value: torch.Tensor) -> list[Any]:
     return value.tolist() if value.ndim == 1 else list(value.cpu().numpy())
 
 
-def _count(value: Any) -> int:
+def _count(value: BatchedRecord | torch.Tensor) -> int:
     return _count(next(iter(value.batched_fields()))[1]) if isinstance(value, BatchedRecord) else len(value)
 
 
@@ -73,17 +80,17 @@ def nonzero(mask: torch.Tensor) -> torch.Tensor:
     return mask.nonzero().squeeze(1)
 
 
-def array_module(values: Any) -> Any:
+def array_module(values: Array) -> ModuleType:
     """Return the module, NumPy or PyTorch, whose functions accept ``values``."""
     return np if isinstance(values, np.ndarray) else sys.modules["torch"]
 
 
-def empty_like(values: Any, shape: tuple[int, ...]) -> Any:
+def empty_like(values: ArrayT, shape: tuple[int, ...]) -> ArrayT:
     """Return an uninitialized array of ``shape``, of the kind, type and device of ``values``."""
     return np.empty(shape, values.dtype) if isinstance(values, np.ndarray) else values.new_empty(shape)
 
 
-def padded(values: Any, more: int) -> Any:
+def padded(values: torch.Tensor, more: int) -> torch.Tensor:
     """Pad the tensor ``values`` (c, K, ...) with ``more`` zeros along the second axis."""
     if not more:
         return values
@@ -92,7 +99,7 @@ def padded(values: Any, more: int) -> Any:
     return wide
 
 
-def contiguous(values: Any) -> Any:
+def contiguous(values: ArrayT) -> ArrayT:
     """Return ``values``, or a contiguous copy; a NumPy array is also converted to int32 or float64."""
     if isinstance(values, np.ndarray):
         return np.ascontiguousarray(values, np.int32 if values.dtype.kind == "i" else np.float64)
@@ -100,7 +107,7 @@ def contiguous(values: Any) -> Any:
 
 
 def launch_on(
-    target: Any,
+    target: Array,
     kernel: Any,
     dim: int | tuple[int, ...],
     *,
@@ -111,7 +118,7 @@ def launch_on(
     """Launch ``kernel`` on the device of ``target``.
 
     Args:
-        target: a NumPy array, a tensor, or a PyTorch device.
+        target: any array or tensor on the device.
         kernel: the Warp kernel.
         dim: launch dimensions.
         inputs: arguments; a contiguous array or tensor is given as a pair (array, element type).
@@ -122,16 +129,65 @@ def launch_on(
     if isinstance(target, np.ndarray):
         launch_cached(kernel, dim, inputs=input_arrays, outputs=output_arrays, device=wp.get_device("cpu"))
         return
-    device = wp.device_from_torch(getattr(target, "device", target))
+    device = wp.device_from_torch(target.device)
     wp.launch(kernel, dim, inputs=input_arrays, outputs=output_arrays, device=device, block_dim=block_dim)
 
 
-def as_warp(values: Any, dtype: Any) -> wp.array:
+def as_warp(values: Array, dtype: type) -> wp.array:
     """Return a Warp array that shares the memory of ``values``, a tensor or a NumPy array."""
     if isinstance(values, np.ndarray):
         return wp.array(values, dtype=dtype, device="cpu", copy=False)
     return wp.from_torch(values, dtype=dtype)
 
 
+def as_world(array: wp.array) -> wp.array:
+    """Return ``array`` (n,) with a leading axis of one world, (1, n)."""
+    return array.reshape((1, array.shape[0]))
+
+
 def _array(value: Any) -> Any:
     return as_warp(*value) if isinstance(value, tuple) else value
+
+
+def allocate_struct(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: wp.Device, **arrays: wp.array) -> Any:
+    """Return an instance of a Warp ``struct`` with zeroed arrays on ``device``, of the given ``shapes`` by field, and
+    with the given ``arrays``."""
+    instance = struct()
+    for name, array in (_zeroed_fields(struct, shapes, device) | arrays).items():
+        setattr(instance, name, array)
+    return instance
+
+
+def _zeroed_fields(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: wp.Device) -> dict[str, wp.array]:
+    """Return zeroed arrays of the given ``shapes`` with the element types of the fields of ``struct``."""
+    return {name: wp.zeros(shape, dtype=struct.vars[name].type.dtype, device=device) for name, shape in shapes.items()}
+
+
+class StructPerWorld:
+    """A Warp struct with arrays for each of B worlds, as an array of structs on a device.
+
+    ``structs`` (B,) is the argument of a kernel. The structs hold the addresses of the arrays, so this object must
+    exist as long as they are used.
+    """
+
+    def __init__(
+        self, struct: Any, shapes: Mapping[str, tuple[int, ...]], worlds: int, device: wp.Device, **arrays: wp.array
+    ) -> None:
+        """Allocate zeroed arrays.
+
+        Args:
+            struct: the struct.
+            shapes: shape of each array in one world, by field.
+            worlds: number of worlds B.
+            device: device of the arrays.
+            arrays: arrays that all worlds share, by field.
+        """
+        own = _zeroed_fields(struct, {name: (worlds, *shape) for name, shape in shapes.items()}, device)
+        self._arrays = own | arrays  # The structs hold only addresses.
+        table: Any = np.zeros(worlds, struct.numpy_dtype())
+        for name, array in own.items():
+            table[name] = array[0].__ctype__().numpy_value()
+            table[name]["data"] += np.arange(worlds, dtype=np.uint64) * np.uint64(array.strides[0])
+        for name, array in arrays.items():
+            table[name] = array.__ctype__().numpy_value()
+        self.structs = wp.array(table, dtype=struct, device=device)

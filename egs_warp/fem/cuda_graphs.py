@@ -35,14 +35,14 @@ class GraphStream:
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
-        self._stream: Any = None
+        self._stream: torch.cuda.Stream | None = None
         self._of_warp: wp.Stream | None = None
         if device.type == "cuda":
             self._of_warp = wp.get_device(str(device)).stream
             self._stream = wp.stream_to_torch(self._of_warp)
-        self._others: list[Any] = []
+        self._others: list[torch.cuda.Stream] = []
         self._pool: Any = None
-        self._first: Any = None
+        self._first: torch.cuda.CUDAGraph | None = None
 
     def __enter__(self) -> None:
         """Make this PyTorch's current stream and disable gradients."""
@@ -70,7 +70,7 @@ class GraphStream:
         if self._stream is not None:
             self._stream.synchronize()
 
-    def record_event(self, event: Any) -> Any:
+    def record_event(self, event: torch.cuda.Event | None) -> torch.cuda.Event | None:
         """Record ``event``, or a new event, after all work queued so far and return it; None on a CPU."""
         if self._stream is None:
             return None
@@ -177,7 +177,7 @@ class PinnedUpload:
 
     def __init__(self, stream: GraphStream, count: int) -> None:
         self.host, self._stream = stream.pinned(count), stream
-        self._copied: Any = None
+        self._copied: torch.cuda.Event | None = None
         self.device = torch.zeros(count, dtype=torch.float64, device=stream.device)
 
     def set(self, *parts: np.ndarray) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from egs_warp.fem.batched import BatchedRecord, array_module
+from egs_warp.fem.batched import ArrayT, BatchedRecord, array_module
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.momentum_projection import MomentumProjection
 
@@ -24,25 +24,25 @@ class UnsolvableStepError(ArithmeticError):
     """The equations of a step cannot be solved."""
 
 
-class StepValues(Protocol):
+class StepValues(Protocol[ArrayT]):
     """Values that the subclasses of ``ImplicitStep`` provide."""
 
-    node_mass: Any
+    node_mass: ArrayT
     """(N,) kg, lumped masses."""
-    gravity: Any
+    gravity: ArrayT
     """(3,) m/s^2, gravitational acceleration."""
-    rotation_modes: Any
+    rotation_modes: ArrayT
     """(..., 3N, 3) m, nodal velocities e_k x r of unit rotations about the centre of mass, with lever arms r."""
-    inverse_inertia: Any
+    inverse_inertia: ArrayT
     """(..., 3, 3) 1/(kg m^2), inverse inertia at the start of the step."""
 
-    def internal_gradient(self, velocities: Any, tension: Any) -> Any:
+    def internal_gradient(self, velocities: ArrayT, tension: Any) -> ArrayT:
         """Return minus the forces of elasticity, damping and muscles at the end of the step: (..., N, 3) N."""
         ...
 
 
 @dataclass(frozen=True)
-class ImplicitStep(StepValues, BatchedRecord):
+class ImplicitStep(StepValues[ArrayT], BatchedRecord):
     """The equation of one implicit step.
 
     Implicit Euler alone loses angular momentum. With x+ = x + dt v, the momentum changes by dt sum r x f, where r are
@@ -63,13 +63,13 @@ class ImplicitStep(StepValues, BatchedRecord):
     """alpha of the Rayleigh damping (air drag), 1/s."""
 
     @property
-    def momenta(self) -> Any:
+    def momenta(self) -> ArrayT:
         """(..., 3, 3N) kg m, matrix that maps nodal velocities to the angular momentum about the centre of mass, with
         lever arms r."""
         return (self.rotation_modes * self.coordinate_mass[:, None]).swapaxes(-1, -2)
 
     @property
-    def coordinate_mass(self) -> Any:
+    def coordinate_mass(self) -> ArrayT:
         """(3N,) kg, mass of each coordinate."""
         mass = self.node_mass
         return array_module(mass).broadcast_to(mass[:, None], (len(mass), 3)).reshape(-1)
@@ -89,26 +89,26 @@ class ImplicitStep(StepValues, BatchedRecord):
         """Speed that free fall gains in the step, m/s."""
         return self.residual_scale / self.body.mass
 
-    def end_positions(self, velocities: Any) -> Any:
+    def end_positions(self, velocities: ArrayT) -> ArrayT:
         """Return x + dt v (..., N, 3), m."""
         return self.state.positions + self.dt * velocities
 
     @property
-    def ballistic_positions(self) -> Any:
+    def ballistic_positions(self) -> ArrayT:
         """(..., N, 3) m, end positions of the nodes without internal and contact forces."""
         return self.end_positions(self.state.velocities + self.dt * self.gravity)
 
-    def momentum_correction(self, internal_gradient: Any) -> Any:
+    def momentum_correction(self, internal_gradient: ArrayT) -> ArrayT:
         """Return the angular velocity (..., 3) rad/s of the rotation whose momentum implicit Euler alone would lose."""
         flat = internal_gradient.reshape((*internal_gradient.shape[:-2], -1, 1))
         return self.momentum_correction_from_torque((self.rotation_modes.swapaxes(-1, -2) @ flat)[..., 0])
 
-    def momentum_correction_from_torque(self, torque: Any) -> Any:
+    def momentum_correction_from_torque(self, torque: ArrayT) -> ArrayT:
         """Return ``momentum_correction`` of an internal gradient with ``torque`` (..., 3) N m about the centre of
         mass."""
         return self.dt * (self.inverse_inertia @ torque[..., None])[..., 0]
 
-    def residual(self, velocities: Any, tension: Any) -> Any:
+    def residual(self, velocities: ArrayT, tension: Any) -> ArrayT:
         """Return the residual, the left side minus the right side of the equation, without contact forces.
 
         Args:
@@ -123,7 +123,7 @@ class ImplicitStep(StepValues, BatchedRecord):
         change = self.inertia_ratio * velocities - self.state.velocities - self.dt * self.gravity
         return self.node_mass[:, None] * (change - correction.reshape(velocities.shape)) + self.dt * internal
 
-    def momentum_projection(self, momenta: Any, rotation_response: Any) -> MomentumProjection:
+    def momentum_projection(self, momenta: ArrayT, rotation_response: ArrayT) -> MomentumProjection[ArrayT]:
         """Return the momentum projection of a tangent.
 
         Args:

@@ -3,38 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Generic, Self
 
 import numpy as np
 
-from egs_warp.fem.batched import BatchedRecord, array_module
+from egs_warp.fem.batched import ArrayT, BatchedRecord, array_module
 
 
 @dataclass(frozen=True, eq=False)
-class MomentumProjection(BatchedRecord):
+class MomentumProjection(BatchedRecord, Generic[ArrayT]):
     """Correction by rigid rotations that gives solutions the angular momenta of their right-hand sides.
 
     Arrays are NumPy arrays or PyTorch tensors, also with a leading world axis.
     """
 
-    rotation_modes: Any
+    rotation_modes: ArrayT
     """(n, 3) rigid rotations T, as nodal velocities."""
-    mode_momenta: Any
+    mode_momenta: ArrayT
     """(n, 3) M T; (M T)^T v is the angular momentum of velocities v."""
     inertia_ratio: float
     """Factor of the angular momentum of a solution, 1 + dt alpha."""
-    rotation_response: Any
+    rotation_response: ArrayT
     """(n, 3) U, solutions for the right-hand sides M T."""
-    inverse: Any
+    inverse: ArrayT
     """(3, 3) inverse of inertia_ratio (M T)^T U."""
 
     @classmethod
     def of(
         cls,
-        rotation_modes: Any,
-        mode_momenta: Any,
+        rotation_modes: ArrayT,
+        mode_momenta: ArrayT,
         inertia_ratio: float,
-        rotation_response: Any,
+        rotation_response: ArrayT,
     ) -> Self:
         """Build the projection; arguments as the fields. With PyTorch tensors, the inverse of a singular matrix is not
         finite, because an exception would stop all worlds.
@@ -44,7 +44,7 @@ class MomentumProjection(BatchedRecord):
         inverse = linalg.inv(matrix) if linalg is np.linalg else linalg.inv_ex(matrix).inverse
         return cls(rotation_modes, mode_momenta, inertia_ratio, rotation_response, inverse)
 
-    def corrected(self, right: Any, plain: Any) -> Any:
+    def corrected(self, right: ArrayT, plain: ArrayT) -> ArrayT:
         """Return the corrected solution.
 
         Args:

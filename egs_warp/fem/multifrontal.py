@@ -1,6 +1,6 @@
 """Multifrontal L D L^T factorization of a step's sparse matrix, with solves for many right-hand sides.
 
-The kernels are in ``egs_warp.kernels.fem.supernodal`` and ``products``.
+The kernels are in ``egs_warp.kernels.fem.supernodal``, ``quadratic_form`` and ``products``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.fem.supernodes import Supernodes, first_of_equal_rows
 from egs_warp.kernels.fem import supernodal as kernels
-from egs_warp.kernels.fem.products import Rows
+from egs_warp.kernels.fem.products import PANEL, Rows
+from egs_warp.kernels.fem.quadratic_form import quadratic_form_kernel
 from egs_warp.launching import launch_cached, run_concurrently, zeros
 from egs_warp.precision import real
 
@@ -175,7 +176,7 @@ class MultifrontalLdl:
         self._added = np.ascontiguousarray(across), np.ascontiguousarray(through), np.ascontiguousarray(inverse)
         return True
 
-    def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
+    def solve(self, right: np.ndarray, projection: MomentumProjection[np.ndarray] | None = None) -> np.ndarray:
         """Solve for ``right``; see ``LinearSolver.solve``."""
         if self._added is None:
             return self._solve_unprojected(right, projection)
@@ -200,7 +201,7 @@ class MultifrontalLdl:
         count = vectors.shape[1]
         if self.status is FactorStatus.NONE:
             return np.full((count, count), np.nan), np.full(count, np.nan)
-        panels = -(-count // kernels.PANEL)
+        panels = -(-count // PANEL)
         if self._effort is None or len(self._effort.linear) != panels:
             self._effort = _EffortWorkspace(panels, self._unknowns)
         workspace, vectors = self._effort, np.asarray(vectors, dtype=np.float64)
@@ -208,7 +209,7 @@ class MultifrontalLdl:
         self._full_values[:] = entries[self._full_from_upper]
         workspace.reference[:], workspace.gradient[:] = reference, gradient
         self._launch_two_threads(
-            kernels.effort_panel_kernel,
+            quadratic_form_kernel,
             panels,
             [
                 *self._factor_arguments,
@@ -223,11 +224,13 @@ class MultifrontalLdl:
         )
         return workspace.quadratic[:count, :count].copy(), workspace.linear.ravel()[:count].copy()
 
-    def _solve_unprojected(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
+    def _solve_unprojected(
+        self, right: np.ndarray, projection: MomentumProjection[np.ndarray] | None = None
+    ) -> np.ndarray:
         assert self.status is not FactorStatus.NONE, "call factor() first"
         right = np.asarray(right, dtype=np.float64)
         solution = np.empty(right.shape)
-        panels = -(-(1 if right.ndim == 1 else right.shape[1]) // kernels.PANEL)
+        panels = -(-(1 if right.ndim == 1 else right.shape[1]) // PANEL)
         struct = self._no_projection if projection is None else self._projection.load(projection)
         inputs = [
             *self._factor_arguments,
@@ -251,7 +254,7 @@ class MultifrontalLdl:
         else:
             launch()
 
-    def solving_one(self, projection: MomentumProjection) -> tuple[list[Any], list[int], wp.array]:
+    def solving_one(self, projection: MomentumProjection[np.ndarray]) -> tuple[list[Any], list[int], wp.array]:
         """Return the kernel arguments of a solve for one right-hand side (``supernodal.solve_vector_native``).
 
         Args:
@@ -280,7 +283,7 @@ class MultifrontalLdl:
         return [right.ctypes.data, *(strides if right.ndim > 1 else [*strides, 0]), right[0].size]
 
     def _workspace_for(self, panels: int) -> wp.array:
-        size = panels * (self._unknowns + 4) * kernels.PANEL
+        size = panels * (self._unknowns + 4) * PANEL
         if self._workspace.size < size:
             self._workspace = _shared_zeros(size)[1]
         return self._workspace
@@ -301,9 +304,9 @@ class _ProjectionArrays:
             self._arrays[name], array = _shared_zeros(size)
             setattr(self.struct, name, array)
         self._ratio, self.struct.inertia_ratio = _shared_zeros(1)
-        self._loaded: MomentumProjection | None = None
+        self._loaded: MomentumProjection[np.ndarray] | None = None
 
-    def load(self, projection: MomentumProjection) -> Any:
+    def load(self, projection: MomentumProjection[np.ndarray]) -> Any:
         """Copy ``projection`` to the arrays, unless it was the last one, and return the kernels' struct."""
         if self._loaded is not projection:
             self._loaded, self._ratio[0] = projection, projection.inertia_ratio
@@ -316,11 +319,11 @@ class _EffortWorkspace:
     """Workspace of ``quadratic_form`` for a given number of panels."""
 
     def __init__(self, panels: int, unknowns: int) -> None:
-        self.moves, self.products = (zeros((panels, unknowns, kernels.PANEL), real, "cpu") for _ in range(2))
+        self.moves, self.products = (zeros((panels, unknowns, PANEL), real, "cpu") for _ in range(2))
         self.reference, self.reference_array = _shared_zeros(unknowns)
         self.gradient, self.gradient_array = _shared_zeros(unknowns)
-        self.linear, self.linear_array = _shared_zeros((panels, kernels.PANEL))
-        self.quadratic, self.quadratic_array = _shared_zeros((panels * kernels.PANEL, panels * kernels.PANEL))
+        self.linear, self.linear_array = _shared_zeros((panels, PANEL))
+        self.quadratic, self.quadratic_array = _shared_zeros((panels * PANEL, panels * PANEL))
 
 
 def _shared_zeros(size: int | tuple[int, ...]) -> tuple[np.ndarray, wp.array]:

@@ -11,6 +11,7 @@ import warp as wp
 from egs_warp.fem.assembly_topology import AssemblyTopology, Material
 from egs_warp.kernels.fem import elasticity_cpu as kernels
 from egs_warp.kernels.fem.elasticity import DIAGONAL_TOLERANCE, MAX_SWEEPS
+from egs_warp.kernels.fem.element_groups import LANES, PAIRS, Elements, MuscleSegments
 from egs_warp.launching import PinnedMirror, empty, launch_cached, zeros
 from egs_warp.muscles.tension import LENGTH_FULL_FORCE, LENGTH_ZERO_FORCE
 from egs_warp.precision import real
@@ -23,7 +24,7 @@ class SimdSegments:
         self.rows = rows
         self.tensions = PinnedMirror(zeros(len(rest_lengths), real, device))
         """(M,) N, tensions, which the host sets."""
-        self.struct = kernels.MuscleSegments()
+        self.struct = MuscleSegments()
         self.struct.offsets, self.struct.nodes = (
             wp.array(part.astype(np.int32), dtype=int, device=device) for part in (rows.indptr, rows.indices)
         )
@@ -39,12 +40,12 @@ class SimdElasticity:
 
     def __init__(self, maps: AssemblyTopology, material: Material, device: wp.Device) -> None:
         self._device, self._node_count, tet_count = device, len(maps.corner_offsets) - 1, len(maps.tets)
-        more = -tet_count % kernels.LANES
+        more = -tet_count % LANES
         # Copies of the last element with zero volume fill the last group.
         padded = np.r_[np.arange(tet_count), np.full(more, tet_count - 1)]
-        groups = len(padded) // kernels.LANES
-        rests = maps.rest_inverses[padded].reshape(groups, kernels.LANES, 9).transpose(0, 2, 1)
-        elements = kernels.Elements()
+        groups = len(padded) // LANES
+        rests = maps.rest_inverses[padded].reshape(groups, LANES, 9).transpose(0, 2, 1)
+        elements = Elements()
         elements.corners = wp.array(maps.tets[padded].ravel(), dtype=int, device=device)
         elements.rests = wp.array(np.ascontiguousarray(rests).ravel(), dtype=real, device=device)
         elements.volumes = wp.array(
@@ -110,11 +111,11 @@ class SimdElasticity:
 
 
 def _entries_of_pairs(maps: AssemblyTopology) -> np.ndarray:
-    """Return the matrix entries (T, 78) int32 of each element (``kernels.Elements.entries``)."""
+    """Return the matrix entries (T, 78) int32 of each element (``Elements.entries``)."""
     tets, count = maps.tets.astype(np.int64), len(maps.corner_offsets) - 1
     i, k = np.divmod(np.arange(9), 3)
     parts = []
-    for a, b in kernels.PAIRS:
+    for a, b in PAIRS:
         one, other = tets[:, a], tets[:, b]
         block = np.searchsorted(maps.block_keys, np.minimum(one, other) * count + np.maximum(one, other))
         # A block below the diagonal is the transpose of its counterpart above.

@@ -11,6 +11,15 @@ import numpy as np
 
 TYPES = {name: np.dtype(name).newbyteorder("<") for name in ("uint8", "uint16", "uint32", "float32")}
 """Stored types by their names in the file; little-endian."""
+_METHODS = (
+    (zlib.Z_DEFAULT_STRATEGY, 8),
+    (zlib.Z_DEFAULT_STRATEGY, 5),
+    (zlib.Z_FILTERED, 6),
+    (zlib.Z_RLE, 3),
+    (zlib.Z_HUFFMAN_ONLY, 5),
+)
+"""Strategies and memory levels of zlib; an array uses those with which it has the fewest bytes. Planes of noise are
+smallest without matches, and with codes that are renewed often."""
 _MAX_RATIO = 1032
 """Maximum ratio of inflated to deflated bytes that RFC 1951 allows."""
 
@@ -44,7 +53,7 @@ class PackedArray:
             stored = np.concatenate([stored[:1], np.diff(stored, axis=0)])
         width = stored.dtype.itemsize * math.prod(stored.shape[1:])
         planes = np.ascontiguousarray(stored).view(np.uint8).reshape(len(stored), width).T
-        return zlib.compress(np.ascontiguousarray(planes).tobytes(), 9)
+        return _deflated(np.ascontiguousarray(planes).tobytes())
 
     def entry(self, offset: int, size: int) -> dict[str, Any]:
         """Return the JSON object that describes this array, whose ``size`` bytes begin at ``offset`` of the data."""
@@ -86,6 +95,16 @@ class PackedArray:
             return cls(stored, delta=delta)
         lower, step = (np.array(entry[name], np.float64) for name in ("lower", "step"))
         return cls(stored, lower, step, entry["error"], delta)
+
+
+def _deflated(data: bytes) -> bytes:
+    """Return ``data`` in the shortest zlib stream of ``_METHODS``."""
+
+    def stream(strategy: int, memory: int) -> bytes:
+        deflater = zlib.compressobj(9, zlib.DEFLATED, zlib.MAX_WBITS, memory, strategy)
+        return deflater.compress(data) + deflater.flush()
+
+    return min((stream(*method) for method in _METHODS), key=len)
 
 
 def quantised(

@@ -22,6 +22,11 @@ from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.meshing.level_set import LevelSet
 from egs_warp.short_repr import short_repr
 
+_SLEEP_SPEED = 1e-6
+"""Maximum speed of the nodes of a prop that falls asleep, in sqrt(g H)."""
+_SLEEP_STEPS = 20
+"""Number of successive steps below ``_SLEEP_SPEED`` after which a prop falls asleep."""
+
 
 @dataclass(frozen=True)
 class WorldBody:
@@ -61,6 +66,8 @@ class WorldStepper:
         )
         """Contact between the bodies."""
         self._islands: dict[tuple[int, ...], IslandStepper] = {}
+        self._quiet_steps = np.zeros(len(bodies), int)
+        self._last_reports: list[StepReport | None] = [None] * len(bodies)
 
     def initial_memories(self) -> list[WarmStart]:
         """Return the warm start of a first step of each body."""
@@ -85,21 +92,58 @@ class WorldStepper:
             For each body, the report of each step into which its step was divided, in order. The last report contains
             the state at the end and the warm start of the next step (``WarmStart.from_report``). The contacts of a
             report include those with other bodies (``IslandStepper``); their faces are negative.
+
+        Props that have been at rest for some steps sleep until a body that is awake comes close: they are not moved,
+        and their contact forces stay.
         """
         done: list[list[StepReport]] = [[] for _ in self.bodies]
         for members in self.islands(states, dt):
-            if len(members) == 1:
+            asleep = self._asleep(members, states, memories, dt)
+            if asleep is not None:
+                for body, report in zip(members, asleep, strict=True):
+                    done[body] = [report]
+            elif len(members) == 1:
                 body = members[0]
                 memory = _with_ground_only(memories[body], self.pairs.point_counts[body])
                 _, _, done[body] = self.bodies[body].stepper.advance(states[body], memory, objectives[body], dt)
-                continue
-            with one_blas_thread():
-                reports = self._island(members).advance(
-                    [states[i] for i in members], [memories[i] for i in members], [objectives[i] for i in members], dt
-                )
-            for body, each in zip(members, reports, strict=True):
-                done[body] = each
+            else:
+                parts = [states[i] for i in members], [memories[i] for i in members], [objectives[i] for i in members]
+                with one_blas_thread():
+                    reports = self._island(members).advance(*parts, dt)
+                for body, each in zip(members, reports, strict=True):
+                    done[body] = each
+        self._count_quiet_steps(done)
         return done
+
+    def _asleep(
+        self, members: Sequence[int], states: Sequence[BodyState], memories: Sequence[WarmStart], dt: float
+    ) -> list[StepReport] | None:
+        """Return the reports of an island whose bodies all sleep, with the last contact forces; None if one is awake or
+        its state is not the one in which it fell asleep."""
+        reports = []
+        for body in members:
+            last, state = self._last_reports[body], states[body]
+            if (
+                last is None
+                or self._quiet_steps[body] < _SLEEP_STEPS
+                or last.dt != dt
+                or not np.array_equal(last.contacts.points, memories[body].points)
+                or not np.array_equal(last.forces, memories[body].forces)
+                or not np.array_equal(last.state.positions, state.positions)
+                or not np.array_equal(last.state.velocities, state.velocities)
+            ):
+                return None
+            reports.append(replace(last, state=replace(state, time=state.time + dt), newton_iterations=0))
+        return reports
+
+    def _count_quiet_steps(self, done: Sequence[Sequence[StepReport]]) -> None:
+        for body, reports in enumerate(done):
+            last, soft_body = reports[-1], self.bodies[body].stepper.body
+            is_prop = self.bodies[body].stepper.muscles.segment_count == 0
+            speed = np.abs(last.state.velocities).max()
+            is_quiet = is_prop and last.converged and len(reports) == 1 and speed < _SLEEP_SPEED * soft_body.speed_unit
+            self._quiet_steps[body] = self._quiet_steps[body] + 1 if is_quiet else 0
+            self._last_reports[body] = last
 
     def islands(self, states: Sequence[BodyState], dt: float) -> list[tuple[int, ...]]:
         """Return the islands of a step of ``dt`` s: bodies whose inflated boxes overlap at the end of a ballistic

@@ -48,9 +48,7 @@ def random_program(seed: int) -> CoulombProgram:
 def under(program: CoulombProgram, activations: np.ndarray) -> np.ndarray:
     """Return x: ``activations`` (2,) followed by the contact forces under exact contact."""
     free = program.offset + program.rows[:, :2] @ activations
-    forces, residual = coulomb_forces(
-        program.rows[:, 2:], free, np.zeros(CONTACTS), FRICTION, np.zeros((CONTACTS, 3)), tolerance=1e-12
-    )
+    forces, residual = coulomb_forces(program.rows[:, 2:], free, np.zeros(CONTACTS), FRICTION, np.zeros((CONTACTS, 3)))
     assert residual < 1e-9
     return np.concatenate([activations, forces.ravel()])
 

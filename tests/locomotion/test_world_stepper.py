@@ -106,3 +106,32 @@ def test_bodies_that_are_apart_move_as_they_do_alone() -> None:
         alone, alone_memory, reports = made.stepper.advance(alone, alone_memory, own, dt)
         alone_report = reports[-1]
         assert np.array_equal(states[0].positions, alone.positions)
+
+
+def test_a_prop_at_rest_sleeps_until_it_is_hit() -> None:
+    world = RunningWorld([box_body((0.3, 0.3, 0.2)), box_body((0.2, 0.2, 0.2))], [(0.0, 0.0, 0.0), (0.05, 0.0, 1.2)])
+    iterations, loads = [], []
+    for _ in range(80):
+        world.advance(DT)
+        (report,) = world.reports[0]
+        iterations.append(report.newton_iterations)
+        loads.append(report.forces[report.contacts.faces >= 0, 0].sum() / world.bodies[0].weight)
+    hit = int(np.argmax(np.array(loads) > 1.1))
+    # A fall of 1 m takes 0.45 s.
+    assert 45 < hit < 60
+    assert max(iterations[30 : hit - 3]) == 0 and min(iterations[hit : hit + 5]) > 0
+    assert np.allclose(loads[30 : hit - 3], 1.0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_pile_of_eight_comes_to_rest() -> None:
+    random = np.random.default_rng(3)
+    places = [(*random.uniform(-0.12, 0.12, 2), 0.05 + 0.3 * i) for i in range(8)]
+    world = RunningWorld([box_body((0.25, 0.25, 0.2)) for _ in range(8)], places)
+    for _ in range(round(6.0 / DT)):
+        world.advance(DT)
+    speeds = [np.abs(state.velocities).max() for state in world.states]
+    assert max(speeds) < 1e-3 and world.min_gap > -0.01 * 0.2
+    assert all(
+        body.assembly.determinants(s.positions).min() > 0.9 for body, s in zip(world.bodies, world.states, strict=True)
+    )

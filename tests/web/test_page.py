@@ -202,9 +202,18 @@ def test_front_and_side_look_at_the_front_that_was_found(chromium: Any, file: st
     page.close()
 
 
-def test_a_run_plays_by_itself(chromium: Any, file: str):
-    page, complaints = opened(chromium, file, plays=True)
+_COUNT_SPLATS_AT_START = """const timer = setInterval(() => {
+    if (window.egs === undefined || egs.framePosition === 0) return;
+    window.splatsAtStart = egs.viewers[0].splatRenderer.spark.activeSplats;
+    clearInterval(timer);
+}, 1)"""
+"""JavaScript that counts the splats that are drawn when the second frame begins."""
+
+
+def test_a_run_plays_by_itself_once_its_splats_are_sorted(chromium: Any, file: str):
+    page, complaints = opened(chromium, file, plays=True, scripts=[_COUNT_SPLATS_AT_START])
     wait_until(page, "egs.player.playing && egs.player.framePosition > 3")
+    assert page.evaluate("splatsAtStart") > 0
     page.keyboard.press(" ")
     assert not page.evaluate("egs.player.playing")
     page.close()

@@ -6,7 +6,8 @@ uint64 are addresses of host arrays.
 
 import warp as wp
 
-from egs_warp.kernels.fem.elasticity_cpu import Elements, MuscleSegments, gradient_native
+from egs_warp.kernels.fem.elasticity_cpu import gradient_native
+from egs_warp.kernels.fem.element_groups import Elements, MuscleSegments
 from egs_warp.kernels.fem.supernodal import (
     Fronts,
     MomentumProjection,

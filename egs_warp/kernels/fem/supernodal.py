@@ -5,17 +5,7 @@ The host code is in ``egs_warp.fem.multifrontal``.
 
 import warp as wp
 
-from egs_warp.kernels.fem.products import (
-    PANEL,
-    STRIP,
-    Rows,
-    address_of,
-    claim_next,
-    finish_moves,
-    multiply_strip,
-    wait_for,
-    write_quadratic,
-)
+from egs_warp.kernels.fem.products import PANEL, claim_next
 from egs_warp.kernels.vectors import FRONT_ELIMINATION, on_cpu
 from egs_warp.precision import real
 
@@ -482,62 +472,3 @@ def solve_kernel(
             solution + wp.uint64(8 * PANEL * panel), count,
         )  # fmt: skip
         panel = claim_next(counters, 0)
-
-
-@wp.kernel
-def effort_panel_kernel(
-    counters: wp.array[wp.int32],
-    fronts: Fronts,
-    blocks: wp.int32,
-    unknowns: wp.int32,
-    factor: wp.array[real],
-    inverses: wp.array[real],
-    reciprocals: wp.array[real],
-    right: wp.uint64,
-    row_stride: wp.int32,
-    column_stride: wp.int32,
-    count: wp.int32,
-    weights: wp.uint64,
-    dt_now: real,
-    dt_ahead: real,
-    reference: wp.array[real],
-    gradient: wp.array[real],
-    matrix: Rows,
-    workspace: wp.array[real],
-    # Out:
-    moves: wp.array3d[real],
-    products: wp.array3d[real],
-    linear: wp.array2d[real],
-    quadratic: wp.array2d[real],
-) -> None:
-    """Compute the quadratic model of the elastic energy (``LinearSolver.quadratic_form``).
-
-    For each panel, the displacements X (``moves``), their ``products`` H X and the linear terms X^T g (``linear``) are
-    computed. When all panels are finished, the blocks of X^T H X (``quadratic``) follow. Several launches may share the
-    work through ``counters`` (3,): next panel, next pair of panels, and number of finished panels.
-    """
-    panels = moves.shape[0]
-    panel = claim_next(counters, 0)
-    while panel < panels:
-        panel_address = address_of(moves[panel])
-        solve_panel_native(
-            fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count, weights,
-            dt_now, dt_ahead, MomentumProjection(), panel, workspace, panel_address, PANEL,
-        )  # fmt: skip
-        finish_moves(count - PANEL * panel, reference, gradient, moves[panel], linear[panel])
-        for strip in range(PANEL // STRIP):
-            multiply_strip(
-                unknowns, matrix.offsets, matrix.indices, matrix.first_of_equal_rows, matrix.values, panel_address,
-                PANEL, strip,
-                address_of(products[panel]),
-            )  # fmt: skip
-        claim_next(counters, 2)
-        panel = claim_next(counters, 0)
-    wait_for(counters, 2, panels)
-    pair = claim_next(counters, 1)
-    while pair < panels * panels:
-        first = pair / panels
-        second = pair % panels
-        if first <= second:
-            write_quadratic(first, second, moves[first], products[second], quadratic)
-        pair = claim_next(counters, 1)

@@ -17,6 +17,8 @@ const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
 /** Maximum time per image before the resolution is reduced, s: for a recorded run and for a live session. */
 const MAX_FRAME_TIME = 1 / 15;
 const MAX_LIVE_FRAME_TIME = 1 / 25;
+/** Time for which a recorded video shows the last image, ms. */
+const LAST_IMAGE_TIME = 300;
 const LAYERS: { name: LayerToggle; title: string; on: boolean; key: string }[] = [
   { name: "splats", title: "Creature", on: true, key: "1" },
   { name: "scene", title: "Scene", on: true, key: "2" },
@@ -60,6 +62,8 @@ export class Page {
   private readonly recorder = new VideoRecorder();
   private readonly bar: PlaybackBar;
   private readonly checkboxes = new Map<LayerToggle, HTMLInputElement>();
+  /** True once the splats of the first image have been sorted. */
+  private isDrawn = false;
   private lastTime = 0;
   /** Smoothed time between two images during playback, s. */
   private frameTime = 0;
@@ -115,6 +119,9 @@ export class Page {
     const isStill = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.player.playing = this.live === undefined && this.player.lastFrame > 0 && !isStill;
     this.update();
+    void Promise.all(this.viewers.map((viewer) => viewer.drawSorted())).then(() => {
+      this.isDrawn = true;
+    });
     // In a headset, this is the animation loop of its session.
     this.first.renderer.setAnimationLoop((now) => this.animate(now));
   }
@@ -244,9 +251,13 @@ export class Page {
     const watch = setInterval(() => {
       if (this.player.playing && this.recorder.recording) return;
       clearInterval(watch);
-      this.recorder.stop();
-      this.player.loop = loop;
-      recordButton.classList.remove("on");
+      // The recorder needs time to receive the last image; a slow machine draws only a few images of a short run.
+      for (const viewer of this.viewers) viewer.invalidate();
+      setTimeout(() => {
+        this.recorder.stop();
+        this.player.loop = loop;
+        recordButton.classList.remove("on");
+      }, LAST_IMAGE_TIME);
     }, 50);
   }
 
@@ -305,10 +316,11 @@ export class Page {
     this.bar.update();
   }
 
-  /** True if the next image must wait for the sorting of the splats on a slow machine. With an outdated order, the
-   * ground would hide the body. */
+  /** True if the next image must wait for the sorting of the splats: at the start, and on a slow machine. Without an
+   * order, only the shadow would be visible; with an outdated order, the ground would hide the body. */
   private get isWaitingForSort(): boolean {
-    return this.player.playing && this.frameTime > MAX_FRAME_TIME && this.viewers.some((viewer) => viewer.sorting);
+    if (!this.player.playing) return false;
+    return !this.isDrawn || (this.frameTime > MAX_FRAME_TIME && this.viewers.some((viewer) => viewer.sorting));
   }
 
   private animate(now: number): void {

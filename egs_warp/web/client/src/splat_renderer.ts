@@ -2,7 +2,7 @@
 // (docs/concepts/renderer.md). Many splats share one instance, because the cost of an instance hardly depends on its
 // size. In a software rasteriser, an instance costs a hundred times more than one splat.
 
-import { SparkRenderer } from "@sparkjsdev/spark";
+import { Readback, SparkRenderer, SplatAccumulator } from "@sparkjsdev/spark";
 import * as THREE from "three";
 
 const QUADS_PER_INSTANCE = 1024;
@@ -150,4 +150,15 @@ export function splatRenderer(
     if (viewport !== undefined) (spark.uniforms.renderSize.value as THREE.Vector2).set(viewport.z, viewport.w);
   };
   return { spark, floorDepth };
+}
+
+/** Release what Spark's objects for all renderers keep of a disposed renderer: the listeners with which the renderer
+ * would release these objects, and the last shader with its textures. Other renderers upload the objects again. */
+export function releaseSharedObjects(): void {
+  for (const { fullScreenQuad } of [SplatAccumulator, Readback]) {
+    fullScreenQuad.material = new THREE.RawShaderMaterial({ visible: false });
+    fullScreenQuad.dispose();
+  }
+  SplatAccumulator.emptyTexture.dispose();
+  (SparkRenderer as unknown as { emptyOrdering: THREE.DataTexture }).emptyOrdering.dispose();
 }

@@ -7,7 +7,7 @@ import { fitCamera } from "./fit_camera";
 import { BACKGROUND, FLOOR_DEPTH, Ground } from "./ground";
 import { Headset } from "./headset";
 import type { MainLight } from "./packets";
-import { splatRenderer, type SplatRenderer } from "./splat_renderer";
+import { releaseSharedObjects, splatRenderer, type SplatRenderer } from "./splat_renderer";
 
 export interface StageOptions {
   /** True if the capture was trained with antialiasing. */
@@ -161,5 +161,6 @@ export abstract class Stage {
     spark.dispose();
     this.renderer.dispose();
     this.renderer.forceContextLoss();
+    releaseSharedObjects();
   }
 }

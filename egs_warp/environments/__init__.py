@@ -1,0 +1,1 @@
+"""Environments for reinforcement learning and optimisation over many worlds; they need the extra ``gymnasium``."""
