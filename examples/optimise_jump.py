@@ -8,14 +8,10 @@ It needs the extra gymnasium; on a GPU, 512 worlds are quick: --device cuda:0 --
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 import egs_warp as egs
-
-if TYPE_CHECKING:
-    from egs_warp.environments.vector import CreatureVectorEnv
 
 NAMES = "crouch frames", "crouch speed", "thrust frames", "thrust speed"
 MEAN, SPREAD = np.array([8.0, -0.3, 8.0, 0.6]), np.array([3.0, 0.1, 3.0, 0.3])
@@ -35,12 +31,10 @@ def main(arguments: list[str] | None = None) -> list[float]:
     chosen = parser.parse_args(arguments)
     if chosen.worlds < 4:
         raise egs.UserError(f"--worlds {chosen.worlds}: give at least 4, because the best quarter continues")
-    from egs_warp.environments.vector import CreatureVectorEnv
-
     egs.use_device(chosen.device)
     scene = egs.scene("pawn", device=chosen.device)
     creature = egs.make_creature(scene.object, plane=scene.plane, options=egs.CreatureOptions(nodes=chosen.nodes))
-    worlds = CreatureVectorEnv(creature, chosen.worlds, actions="targets", frames=chosen.frames + 1)
+    worlds = egs.CreatureVectorEnv(creature, chosen.worlds, actions="targets", frames=chosen.frames + 1)
     rng, mean, spread = np.random.default_rng(0), MEAN, SPREAD
     best = []
     for generation in range(chosen.generations):
@@ -55,7 +49,7 @@ def main(arguments: list[str] | None = None) -> list[float]:
     return best
 
 
-def greatest_heights(worlds: CreatureVectorEnv, candidates: np.ndarray, frames: int) -> np.ndarray:
+def greatest_heights(worlds: egs.CreatureVectorEnv, candidates: np.ndarray, frames: int) -> np.ndarray:
     """Return (B,) body heights, how far the centre of mass rises above its start with each of the ``candidates`` (B,
     4). A world whose step cannot be solved counts as 0."""
     crouch_frames, crouch_speed, thrust_frames, thrust_speed = candidates.T

@@ -1,1 +1,4 @@
-"""Environments for reinforcement learning and optimisation over many worlds; they need the extra ``gymnasium``."""
+"""Environments for reinforcement learning and optimisation over many worlds (beyond the paper; extra ``gymnasium``).
+
+Input: a creature, actions of each world. Output: observations, rewards and ended episodes of each world.
+"""

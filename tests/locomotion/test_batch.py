@@ -18,7 +18,7 @@ from egs_warp.motions.script import motion
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.simulated_run import simulate
-from tests.support.creatures import coarse_pawn
+from tests.support.creatures import coarse_pawn, on_its_rim
 from tests.support.waves import wavy_ground
 
 FRICTIONS = (0.8, 0.3, 1.2)
@@ -134,18 +134,6 @@ def test_each_world_on_uneven_ground_equals_a_single_run(creature: Creature, jum
 
 def parts(creature: Creature) -> tuple[SoftBody, MuscleSet, ContactGeometry]:
     return creature.body, creature.muscles, creature.stepper.geometry
-
-
-def on_its_rim(geometry: ContactGeometry, count: int = 12) -> ContactGeometry:
-    """Return the geometry with only ``count`` contact points of the base, the outermost in all directions."""
-    corners = geometry.mesh.nodes[geometry.mesh.tets[geometry.tet_from_point]]
-    places = np.einsum("pw,pwi->pi", geometry.weights, corners)
-    heights = geometry.ground_heights(places)
-    base = np.flatnonzero(heights < 0.01)
-    angles = 2.0 * np.pi * np.arange(count) / count
-    reach = (places[base, :2] - places[base, :2].mean(axis=0)) @ np.stack([np.cos(angles), np.sin(angles)])
-    chosen = np.unique(base[np.argmax(reach, axis=0)])
-    return replace(geometry, tet_from_point=geometry.tet_from_point[chosen], weights=geometry.weights[chosen])
 
 
 def rough(creature: Creature) -> tuple[list[BodyState], np.ndarray, float]:

@@ -30,8 +30,7 @@ from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from egs_warp.pipelines.creature import Creature, initial_stance
-from tests.locomotion.test_batch import on_its_rim
-from tests.support.creatures import coarse_pawn
+from tests.support.creatures import coarse_pawn, on_its_rim
 
 FRICTIONS = (0.8, 0.4, 0.6)
 """With 1.2, the plan of a body that is pushed down amplifies rounding: a start that differs by 1e-15 m changes the
