@@ -162,7 +162,8 @@ def measure_planned(creature: Creature, worlds: int, *, steps: int, alone: int, 
     halved, started, first = 0, watch.now(), 0.0
     for number in range(steps):
         with watch("objectives"):
-            each = [jump.objectives(*now, dt) for jump, *now in zip(motions, states, reports, strict=True)]
+            current = zip(motions, states, reports, strict=True)
+            each = [jump.objectives(start, last, dt) for jump, start, last in current]
             objectives = BatchObjectives.stack(each, len(states[0].positions), device)
         state, done, failed = stepper.advance(state, objectives, dt)
         if bool(failed.any()):

@@ -123,8 +123,8 @@ class CreatureVectorEnv(VectorEnv):
         self.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
         size = self._measurement.vectors.shape[1]
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-        bound, count = (MAX_TARGET, 3) if self.actions is Actions.TARGETS else (1.0, members.shape[1])
-        self.single_action_space = gymnasium.spaces.Box(-bound, bound, (count,), np.float32)
+        self._bound, count = (MAX_TARGET, 3) if self.actions is Actions.TARGETS else (1.0, members.shape[1])
+        self.single_action_space = gymnasium.spaces.Box(-self._bound, self._bound, (count,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -138,7 +138,7 @@ class CreatureVectorEnv(VectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin a new episode in all worlds and return the observations (B, D). The start is always the same, so
         ``seed`` only seeds the random generator of the environment; ``options`` are not used."""
-        super().reset(seed=seed, options=options)
+        super().reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
         self._restart(np.ones(self.num_envs, bool))
         self._measurement = self._measured()
         return self._measurement.vectors, {}
@@ -149,7 +149,7 @@ class CreatureVectorEnv(VectorEnv):
         Returns:
             Observations (B, D), rewards (B,), terminated (B,) bool, truncated (B,) bool, and an empty dictionary.
         """
-        actions = np.clip(np.asarray(actions, dtype=np.float64), self.action_space.low, self.action_space.high)
+        actions = np.clip(np.asarray(actions, dtype=np.float64), -self._bound, self._bound)
         begins = self._ended
         self._restart(begins)
         before = self._measured() if begins.any() else self._measurement

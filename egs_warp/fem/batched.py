@@ -187,7 +187,8 @@ class StructPerWorld:
         table: Any = np.zeros(worlds, struct.numpy_dtype())
         for name, array in own.items():
             table[name] = array[0].__ctype__().numpy_value()
-            table[name]["data"] += np.arange(worlds, dtype=np.uint64) * np.uint64(array.strides[0])
+            stride = array.size * wp.types.type_size_in_bytes(array.dtype) // worlds
+            table[name]["data"] += np.uint64(stride) * np.arange(worlds, dtype=np.uint64)
         for name, array in arrays.items():
             table[name] = array.__ctype__().numpy_value()
         self.structs = wp.array(table, dtype=struct, device=device)

@@ -81,8 +81,9 @@ def objective_form(velocities: torch.Tensor, objectives: Sequence[Objective], st
         staging: buffer through which their rows and targets are uploaded.
     """
     parts = rows_of(objectives, len(velocities))
-    indices, *vectors, rows, targets = staging.upload(*parts).split([part.size for part in parts])
-    return WeightedRows(indices.long(), *vectors, rows.view(-1, len(velocities)), targets).form(velocities)
+    indices, entries, entry_targets, rows, targets = staging.upload(*parts).split([part.size for part in parts])
+    dense = rows.view(-1, len(velocities))
+    return WeightedRows(indices.long(), entries, entry_targets, dense, targets).form(velocities)
 
 
 class StagingBuffer:

@@ -208,5 +208,5 @@ def _script(motion: Script | str, body: Creature, others: Mapping[str, OtherBody
 
 
 def _state_of(member: PlacedBody, runs: Sequence[BodyRun], index: int) -> BodyState:
-    """Return the current state of a body, whose run may not have begun yet."""
+    """Return the current state of a body, whose run may not exist yet."""
     return runs[index].state if index < len(runs) else member.body.start

@@ -46,6 +46,7 @@ def test_activations_are_limited_to_their_rate_and_episodes_begin_again() -> Non
     worlds = CreatureVectorEnv(creature, 2, actions="activations", reward=reward, frames=2)
     observations, _ = worlds.reset()
     assert worlds.observation_space.contains(observations)
+    assert worlds.action_space.shape is not None
     actions = np.ones(worlds.action_space.shape)
     ends = [worlds.step(actions) for _ in range(3)]
     assert [end[1].tolist() for end in ends] == [[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]

@@ -98,7 +98,7 @@ def check_runs(
     reports: list[StepReport | None] = [None] * len(starts)
     all_goals, made = goals(), [[] for _ in starts]
     for number in range(steps):
-        asked = [each(*now, dt) for each, *now in zip(all_goals, states, reports, strict=True)]
+        asked = [each(start, last, dt) for each, start, last in zip(all_goals, states, reports, strict=True)]
         state, steps_done, failed = together.advance(state, asked, dt)
         assert not failed.any()
         for run in made:

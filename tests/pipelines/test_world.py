@@ -34,8 +34,8 @@ def test_a_moved_body_keeps_its_place_in_the_capture() -> None:
     moved = creature.moved((1.0, 2.0, 0.5), 90.0)
     x, y, z = creature.start.positions.T
     np.testing.assert_allclose(moved.start.positions, np.stack([1.0 - y, 2.0 + x, 0.5 + z], axis=1), atol=1e-12)
-    places = [one.frame.capture_points(one.start.positions) for one in (creature, moved)]
-    np.testing.assert_allclose(*places, atol=1e-12)
+    first, second = (one.frame.capture_points(one.start.positions) for one in (creature, moved))
+    np.testing.assert_allclose(first, second, atol=1e-12)
     np.testing.assert_allclose(moved.front.direction @ creature.front.direction, 0.0, atol=1e-12)
     assert moved.body is creature.body and moved.shape is creature.shape
     slippery = moved.with_friction(0.3)

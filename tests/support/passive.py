@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -48,7 +49,8 @@ class PassiveBody:
         start = contacts.transferred_forces(self.points, self.forces)
         if body.assembly.device.is_cpu:
             tangent = problem.tangent(self.factors, problem.rigid_guess, tension)
-            response, muscles = ContactLinearization.of(tangent, contacts), tension
+            response: ContactLinearization = ContactLinearization.of(tangent, contacts)
+            muscles: Any = tension
         else:
             # Elements on the GPU, matrices on the host: the step of an island of one body.
             island = IslandProblem((problem,)).tangent([self.factors], problem.rigid_guess, [tension])
