@@ -26,13 +26,8 @@ four captures)."""
 _CONVERSION_STAGES = {".compressed.ply": 37, ".ply": 27, ".spz": 65, ".sog": 80, ".splat": 1, ".glb": 11}
 """Elapsed time of a conversion, percent of the total, when the file has been written and its comparison with the source
 starts; by name ending (400,000 Gaussians of SH degree 3 on a CPU)."""
-_SCENE_SHARES = {"plane": 12, "ground": 15, "segment": 49, "inpaint": 24}
-"""Duration of each stage of a scene, percent of the total: median of two built-in scenes (koala, narcissus) on a CPU.
-The starts of the stages that follow from it deviate from the measured ones by at most 16 percentage points."""
 _PHOTOS_SHARES = {"pose": 20, "train": 50, "pick": 1, "scene": 15, "prepare": 2, "simulate": 7, "render": 5}
 """Duration of each stage from photos to a film on a CPU, percent of the total."""
-_UNTRAINED_SHARE = 2
-"""Duration of a stage without its training, in the same unit as the shares above."""
 _SMOOTHING = 0.05
 """Smoothing factor of the frame rate. It is small because frames in the air and on the ground alternate, and a frame in
 the air takes a third of the time."""
@@ -53,7 +48,7 @@ _outer: ContextVar[PhotosBar | None] = ContextVar("_outer", default=None)
 def photos_bar(stages: Sequence[str], *, quiet: bool = False, file: TextIO | None = None) -> Iterator[PhotosBar]:
     """Show one bar on ``file`` (default stderr) for all ``stages`` from photos to a film."""
     shares = {stage: _PHOTOS_SHARES[stage] for stage in stages}
-    with _StageBar("photos to film", shares, quiet=quiet, file=file) as bar:
+    with StageBar("photos to film", shares, quiet=quiet, file=file) as bar:
         is_terminal = (file or sys.stderr).isatty()
         shown = PhotosBar(bar, _UPDATE_INTERVAL if is_terminal else _LOG_INTERVAL)
         token = _outer.set(shown)
@@ -66,7 +61,7 @@ def photos_bar(stages: Sequence[str], *, quiet: bool = False, file: TextIO | Non
 class PhotosBar:
     """Bar of all stages from photos to a film."""
 
-    def __init__(self, bar: _StageBar, interval: float) -> None:
+    def __init__(self, bar: StageBar, interval: float) -> None:
         self._bar, self._interval = bar, interval
         self._stage, self._shown = "", 0.0
 
@@ -108,16 +103,14 @@ def conversion_bar(name: str, *, quiet: bool = False, file: TextIO | None = None
 
 
 @contextmanager
-def scene_bar(
-    stages: Mapping[str, bool], *, quiet: bool = False, file: TextIO | None = None
-) -> Iterator[Callable[[str, float], None]]:
-    """Show a bar on ``file`` (default stderr) for ``prepare_scene``, and yield its ``progress`` argument.
+def scene_bar(costs: Mapping[str, float], *, quiet: bool = False, file: TextIO | None = None) -> Iterator[StageBar]:
+    """Show a bar on ``file`` (default stderr) for ``prepare_scene``.
 
-    ``stages`` is the value of ``SceneOptions.stages``.
+    ``costs`` is the value of ``SceneOptions.costs``. The methods ``update`` and ``expect`` of the yielded bar are the
+    arguments ``progress`` and ``expect_costs`` of ``prepare_scene``.
     """
-    shares = {stage: _SCENE_SHARES[stage] if whole else _UNTRAINED_SHARE for stage, whole in stages.items()}
-    with _StageBar("scene", shares, quiet=quiet, file=file) as bar:
-        yield bar.update
+    with StageBar("scene", costs, quiet=quiet, file=file) as bar:
+        yield bar
 
 
 @contextmanager
@@ -163,7 +156,7 @@ def _stages(name: str, done: Mapping[str, int], *, quiet: bool, file: TextIO | N
     """
     ends = [*list(done.values())[1:], 100]
     shares = {stage: end - start for (stage, start), end in zip(done.items(), ends, strict=True)}
-    with _StageBar(name, shares, quiet=quiet, file=file) as bar:
+    with StageBar(name, shares, quiet=quiet, file=file) as bar:
         yield bar.update
 
 
@@ -189,7 +182,7 @@ def _redrawn(draw: Callable[[], object], *, quiet: bool, file: TextIO | None) ->
         thread.join()
 
 
-class _StageBar:
+class StageBar:
     """Progress line with the stage, the elapsed and the remaining time of a computation.
 
     Each stage takes a known share of the total time.
@@ -205,7 +198,7 @@ class _StageBar:
         self._stage, self._stage_start, self._done = "", 0.0, 0.0
         self._stack = ExitStack()
 
-    def __enter__(self) -> _StageBar:
+    def __enter__(self) -> StageBar:
         return self
 
     def __exit__(
@@ -233,6 +226,11 @@ class _StageBar:
         self._shares = {stage: share for stage, share in self._shares.items() if stage not in stages}
         self._starts = dict(zip(self._shares, accumulate(self._shares.values(), initial=0.0), strict=False))
         self._total = sum(self._shares.values())
+
+    def expect(self, shares: Mapping[str, float]) -> None:
+        """Replace the expected shares of the stages by better ones."""
+        self._shares = dict(shares)
+        self.skip(())
 
     def _show_end(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         if kind is None:
