@@ -21,7 +21,7 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, concatenate
 from egs_warp.inpainting.holes import Hole
 from egs_warp.inpainting.inpainters import Inpainter
 from egs_warp.inpainting.new_floor import flat_gaussians, rim_heights, with_gloss
-from egs_warp.inpainting.patch_synthesis import PatchSynthesis
+from egs_warp.inpainting.patch_synthesis import PatchSynthesis, painting_time
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, diffuse_only, rectify
 from egs_warp.inpainting.stains import shaded, stain_around
 from egs_warp.segmentation.plane_search import near_plane
@@ -61,11 +61,11 @@ _MAX_ISLAND_AREA = 0.15
 """Area below which an island of floor inside the hole is discarded, as a fraction of the hole's area."""
 _COLOUR_WEIGHT = 4.0
 """Weight of the squared distance between a Gaussian's colour and the painted colour."""
-_RECTIFY_COST, _PAINT_COST, _STEP_COST = 1.0, 2.4e-4, 3.3e-6
-"""Processor time, s: the face-on picture; painting, per texel of the hole; a training step, per new Gaussian. Measured
-for the koala and the fox on a CPU (painting: 1.7e-4 and 3.4e-4)."""
-_HOLE_FRACTION = 0.8
-"""Area of a hole that is not known yet, as a fraction of its bounding square."""
+_RECTIFY_COST, _STEP_COST = 1.0, 3.3e-6
+"""Processor time, s: the face-on picture, and a training step per new Gaussian. Measured for the koala and the fox on a
+CPU."""
+_HOLE_AREA, _HOLE_DEPTH = 0.8, 0.4
+"""Area and half width of a hole that is not known yet, as fractions of its bounding square and of the square's side."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,8 @@ def inpaint(
         raise UserError("inpaint: the hole covers the whole capture; make it smaller")
     retained = background.subset(~junk)
     clock.lap("rectify")
-    paint_cost, train_cost = _costs(float(grown.sum()), float(grown.sum()) / spacing**2, options.steps)
+    paint_cost = painting_time(float(grown.sum()), float(depth_inside(grown).max()))
+    train_cost = _STEP_COST * float(grown.sum()) / spacing**2 * options.steps
     train_start = _RECTIFY_COST + paint_cost
     total_cost = train_start + train_cost
     show_painting = lambda done: progress((_RECTIFY_COST + paint_cost * done) / total_cost)  # noqa: E731
@@ -212,15 +213,12 @@ def inpaint_cost(hole: Hole | None, *, steps: int) -> float:
         hole: the hole; None if it is not known yet.
         steps: number of training steps.
     """
-    fraction = _HOLE_FRACTION if hole is None else hole.area / hole.bounds()[1] ** 2
-    texels = fraction * _TEXELS_ACROSS**2
-    return _RECTIFY_COST + sum(_costs(texels, texels, steps))
-
-
-def _costs(texels: float, new_count: float, steps: int) -> tuple[float, float]:
-    """Return the expected processor time of painting ``texels`` and of ``steps`` of training ``new_count`` Gaussians,
-    s."""
-    return _PAINT_COST * texels, _STEP_COST * new_count * steps
+    area, depth = _HOLE_AREA, _HOLE_DEPTH
+    if hole is not None:
+        side = hole.bounds()[1]
+        area, depth = hole.area / side**2, float(depth_inside(hole.mask).max()) * hole.window.texel / side
+    texels = area * _TEXELS_ACROSS**2
+    return _RECTIFY_COST + painting_time(texels, depth * _TEXELS_ACROSS) + _STEP_COST * texels * steps
 
 
 def _window_around(background: GaussianCloud, hole: Hole, margin: float) -> tuple[PlaneWindow, np.ndarray, int]:

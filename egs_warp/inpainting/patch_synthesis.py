@@ -7,6 +7,7 @@ kernels are in ``egs_warp/kernels/inpainting/patch_synthesis.py``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -22,6 +23,8 @@ from egs_warp.inpainting.offset_labels import labelled_sources
 from egs_warp.kernels.inpainting.patch_synthesis import RADIUS, search_kernel, vote_kernel
 from egs_warp.launching import launch_rows, zeros
 
+_RIM_FACTOR = 1.4
+"""Number of targets at the coarsest level, relative to that of the hole's pixels."""
 _COARSEST_HALF_WIDTH = 16.0
 """Half width, in pixels, of the hole at the coarsest level, where offsets are chosen."""
 _STRIDES = (8, 4, 2, 1, 8, 4, 2, 1)
@@ -35,6 +38,8 @@ _SCREEN = 0.01
 sqrt(weight) pixels."""
 _STRICT_TOLERANCE = 0.25
 """Tolerance of the last vote at each level, smaller so that the result is as sharp as its sources."""
+_SEARCH_TIME = 16e-6
+"""Processor time of a search per target, s."""
 _START_COST = 55.0
 """Processor time per target of the choice of offsets at the coarsest level, relative to that of a search: 0.88 ms and
 16 us for the koala and the fox on a CPU."""
@@ -90,6 +95,19 @@ class PatchSynthesis:
         _, wide_hole, wide_known, _ = wide
         blended = poisson_blend(work.picture, wide_hole, wide_known | wide_hole, work.sources())[:, : hole.shape[1]]
         return np.where(hole[..., None], np.clip(blended, 0.0, 1.0), image).astype(np.float32)
+
+
+def painting_time(pixels: float, depth: float) -> float:
+    """Return the expected processor time of ``PatchSynthesis.fill`` on a CPU, s.
+
+    Args:
+        pixels: number of pixels of the hole.
+        depth: half width of the hole, pixels.
+    """
+    halvings = max(0, math.ceil(math.log2(max(depth, 1.0) / _COARSEST_HALF_WIDTH)))
+    coarsest = _RIM_FACTOR * pixels / 4.0**halvings
+    searches = PatchSynthesis().rounds * sum(pixels / 4.0**level for level in range(halvings + 1))
+    return _SEARCH_TIME * (_START_COST * coarsest + searches)
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,8 @@ _MIN_LEFT = 0.3
 """Minimum remaining time of a stage, as a fraction of its elapsed time, because a stage that takes longer than usual is
 not about to end."""
 _RELIABLE_FRACTION = 0.1
-"""Finished fraction of a stage from which its own speed, not its usual share, defines its remaining time."""
+"""Fraction of a stage, finished since its first report, from which its own speed, not its usual share, defines its
+remaining time."""
 _UPDATE_INTERVAL, _LOG_INTERVAL = 0.25, 10.0
 """Intervals between two updates of ``photos_bar``, s: on a terminal, and in a log."""
 _outer: ContextVar[PhotosBar | None] = ContextVar("_outer", default=None)
@@ -196,6 +197,7 @@ class StageBar:
         self._outer = _outer.get()
         self._bar: Any = None
         self._stage, self._stage_start, self._done = "", 0.0, 0.0
+        self._first: tuple[float, float] | None = None
         self._stack = ExitStack()
 
     def __enter__(self) -> StageBar:
@@ -217,7 +219,9 @@ class StageBar:
             self._stack.push(self._show_end)
             self._stack.enter_context(_redrawn(self._draw, quiet=self._is_quiet, file=self._options["file"]))
         if stage != self._stage:
-            self._stage, self._stage_start = stage, self._elapsed()
+            self._stage, self._stage_start, self._first = stage, self._elapsed(), None
+        if done > 0.0 and self._first is None:
+            self._first = self._elapsed(), done
         self._done = done
         self._draw()
 
@@ -251,13 +255,15 @@ class StageBar:
     def _left(self, elapsed: float) -> float | None:
         """Return the remaining time, s, ``elapsed`` seconds after the start; None before it can be estimated.
 
-        The time per share is measured in the earlier stages, or in the finished part of the current one. A stage that
-        takes longer than its share is expected to continue for some time.
+        The time per share is measured in the earlier stages, or in the current one since its first report, because the
+        first step may include an import. A stage that takes longer than its share is expected to continue for some
+        time.
         """
         share, start = self._shares.get(self._stage, 0.0), self._starts.get(self._stage, self._total)
         spent = elapsed - self._stage_start
-        if self._done >= _RELIABLE_FRACTION:
-            stage_left = spent * (1.0 - self._done) / self._done
+        first_time, first_done = self._first or (elapsed, self._done)
+        if self._done - first_done >= _RELIABLE_FRACTION:
+            stage_left = (elapsed - first_time) * (1.0 - self._done) / (self._done - first_done)
         elif start > 0.0:
             stage_left = max(self._stage_start / start * share - spent, _MIN_LEFT * spent)
         else:
