@@ -61,9 +61,10 @@ _MAX_ISLAND_AREA = 0.15
 """Area below which an island of floor inside the hole is discarded, as a fraction of the hole's area."""
 _COLOUR_WEIGHT = 4.0
 """Weight of the squared distance between a Gaussian's colour and the painted colour."""
-_RECTIFY_COST, _STEP_COST = 1.0, 3.3e-6
-"""Processor time, s: the face-on picture, and a training step per new Gaussian. Measured for the koala and the fox on a
-CPU."""
+_RECTIFY_COST = 0.9
+"""Processor time of the face-on picture, s; measured for koala, fox, narcissus and pawn on a CPU: 0.8 to 1.2 s."""
+_STEP_COST, _STEP_COST_PER_GAUSSIAN = 0.02, 1e-6
+"""Processor time of a training step, s, and s per new Gaussian; measured in total: 0.03 to 0.04 s."""
 _HOLE_AREA, _HOLE_DEPTH = 0.8, 0.4
 """Area and half width of a hole that is not known yet, as fractions of its bounding square and of the square's side."""
 
@@ -154,7 +155,7 @@ def inpaint(
     retained = background.subset(~junk)
     clock.lap("rectify")
     paint_cost = painting_time(float(grown.sum()), float(depth_inside(grown).max()))
-    train_cost = _STEP_COST * float(grown.sum()) / spacing**2 * options.steps
+    train_cost = _training_time(float(grown.sum()) / spacing**2, options.steps)
     train_start = _RECTIFY_COST + paint_cost
     total_cost = train_start + train_cost
     show_painting = lambda done: progress((_RECTIFY_COST + paint_cost * done) / total_cost)  # noqa: E731
@@ -218,7 +219,12 @@ def inpaint_cost(hole: Hole | None, *, steps: int) -> float:
         side = hole.bounds()[1]
         area, depth = hole.area / side**2, float(depth_inside(hole.mask).max()) * hole.window.texel / side
     texels = area * _TEXELS_ACROSS**2
-    return _RECTIFY_COST + painting_time(texels, depth * _TEXELS_ACROSS) + _STEP_COST * texels * steps
+    return _RECTIFY_COST + painting_time(texels, depth * _TEXELS_ACROSS) + _training_time(texels, steps)
+
+
+def _training_time(new_count: float, steps: int) -> float:
+    """Return the expected processor time of ``steps`` of training ``new_count`` Gaussians, s."""
+    return steps * (_STEP_COST + _STEP_COST_PER_GAUSSIAN * new_count)
 
 
 def _window_around(background: GaussianCloud, hole: Hole, margin: float) -> tuple[PlaneWindow, np.ndarray, int]:
