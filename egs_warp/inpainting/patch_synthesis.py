@@ -97,14 +97,18 @@ class PatchSynthesis:
         return np.where(hole[..., None], np.clip(blended, 0.0, 1.0), image).astype(np.float32)
 
 
-def painting_time(pixels: float, depth: float) -> float:
+def painting_time(pixels: float, depth: float, source_depth: float = math.inf) -> float:
     """Return the expected processor time of ``PatchSynthesis.fill`` on a CPU, s.
 
     Args:
         pixels: number of pixels of the hole.
         depth: half width of the hole, pixels.
+        source_depth: half width of the widest known part, pixels. Levels at which it is narrower than a patch are not
+            used.
     """
-    halvings = max(0, math.ceil(math.log2(max(depth, 1.0) / _COARSEST_HALF_WIDTH)))
+    wanted = math.ceil(math.log2(max(depth, 1.0) / _COARSEST_HALF_WIDTH))
+    usable = 30 if math.isinf(source_depth) else math.floor(math.log2(max(source_depth, 1.0) / (RADIUS + 1)))
+    halvings = max(0, min(wanted, usable))
     coarsest = _RIM_FACTOR * pixels / 4.0**halvings
     searches = PatchSynthesis().rounds * sum(pixels / 4.0**level for level in range(halvings + 1))
     return _SEARCH_TIME * (_START_COST * coarsest + searches)

@@ -40,7 +40,7 @@ def test_a_body_that_falls_over_is_reported_and_one_that_stands_is_not(monkeypat
 
 @pytest.mark.parametrize("lean", [0.75, -0.75])
 def test_a_weak_fibre_is_reported_if_the_body_must_balance(lean: float, tmp_path: Path) -> None:
-    """A leaning pawn, whose centre of mass is 0.03 of its height from the edge of its base, falls with one fibre of 0.01
+    """A leaning pawn, whose centre of mass is 0.03 of its height from an edge of its base, falls with one fibre of 0.01
     body weights, on whichever side the edge is."""
     built = pawn(gaussian_count=3000)
     means = built.cloud.means.numpy()
