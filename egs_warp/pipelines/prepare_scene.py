@@ -45,6 +45,8 @@ _CLEARED = {
 
 _SOLID = 0.1
 """Minimum opacity of Gaussians that define the lowest part of an object."""
+_TRAINED = 0.6
+"""Finished fraction of the stage "segment" after the training at the plane; the estimate of the light takes the rest."""
 _HOVER_FRACTION = 0.03
 """Distance from the plane above which an object hovers, as a fraction of the object's size."""
 
@@ -178,7 +180,7 @@ def prepare_scene(
     expect_costs(expected.costs(cloud.count, object_count=object_count, hole=hole))
     progress("segment", 0.0)
     object_cloud, background_with_hole, notes = segment_scene(
-        cloud, located, options, photographs, progress=lambda done: progress("segment", done)
+        cloud, located, options, photographs, progress=lambda done: progress("segment", _TRAINED * done)
     )
     object_cloud, snap_notes = snap_to_plane(object_cloud, located)
     notes = (*notes, *snap_notes)
