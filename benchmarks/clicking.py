@@ -12,6 +12,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.bitmaps import depth_inside
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
 from egs_warp.pipelines.prepare_scene import SceneOptions, segment_scene
 from egs_warp.render import render_gaussians
@@ -55,17 +56,22 @@ def innermost(mask: np.ndarray) -> tuple[float, tuple[float, float]]:
 
 
 def found_by(
-    cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camera], seconds: dict[str, float]
+    cloud: GaussianCloud,
+    spec: ObjectSpec,
+    cameras: Sequence[Camera],
+    seconds: dict[str, float],
+    plane: Plane | None = None,
 ) -> tuple[LocatedPlane, GaussianCloud, GaussianCloud]:
     """Locate the plane and segment the object that ``spec`` describes.
 
     Args:
         seconds: receives the time of each stage, s.
+        plane: the ground plane; None finds it.
 
     Returns:
         the plane, the object and the background.
     """
-    located, seconds["plane"] = timed(locate_plane, cloud, spec, cameras=cameras)
+    located, seconds["plane"] = timed(locate_plane, cloud, spec, cameras=cameras, plane=plane)
     located, seconds["ground"] = timed(with_measured_ground, cloud, located, spec, cameras)
     parts, seconds["segment"] = timed(segment_scene, cloud, located, SceneOptions(clearing=StraddlingPolicy.SPLIT))
     return located, parts[0], parts[1]

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from egs_warp.contact.terrain import Solid
     from egs_warp.deformation.deformer import Deformer
     from egs_warp.deformation.embedding import embed_gaussians
+    from egs_warp.environments.vector import CreatureVectorEnv
     from egs_warp.errors import ArgumentError, UserError
     from egs_warp.geometry.camera import Camera
     from egs_warp.geometry.gaussians import GaussianCloud, concatenate
@@ -80,6 +81,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "contact.terrain": ("Solid",),
     "deformation.deformer": ("Deformer",),
     "deformation.embedding": ("embed_gaussians",),
+    "environments.vector": ("CreatureVectorEnv",),
     "errors": ("ArgumentError", "UserError"),
     "geometry.camera": ("Camera",),
     "geometry.gaussians": ("GaussianCloud", "concatenate"),
@@ -151,6 +153,7 @@ __all__ = [
     "Click",
     "Creature",
     "CreatureOptions",
+    "CreatureVectorEnv",
     "Deformer",
     "Densification",
     "Drive",

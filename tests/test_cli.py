@@ -98,7 +98,7 @@ def test_bad_input_is_one_line(
         (["--up", "-w"], "argument --up: expected one argument"),
         (["--frames", "many"], "argument --frames: invalid int value: 'many'; see egs-warp animate --help"),
         (["--nonsense"], "unrecognized arguments: --nonsense"),
-        (["--out", ""], "argument --out: the name is empty; give a name"),
+        (["--out", ""], "argument --out/-o: the name is empty; give a name"),
         (["--out", "{tmp}/file/out"], "file is a file); choose another one"),
     ],
 )

@@ -53,6 +53,13 @@ def test_example_writes_its_files(tmp_path: Path, name: str, motion: str, asked:
     assert film.stat().st_size > 0 and (tmp_path / "sheet.png").stat().st_size > 0
 
 
+@pytest.mark.example
+def test_the_optimised_jump_gets_higher() -> None:
+    pytest.importorskip("gymnasium")
+    heights = example("optimise_jump").main(["--worlds", "4", "--generations", "2", "--frames", "20"])
+    assert len(heights) == 2 and 0.0 < heights[0] <= heights[1] < 2.0
+
+
 @pytest.mark.parametrize(
     ("name", "flags", "message"),
     [

@@ -9,7 +9,6 @@ TESTS = Path(__file__).parent
 ROOT = TESTS.parent
 FILES = sorted(TESTS.rglob("test_*.py"))
 ACROSS = {
-    "contact/test_two_bodies.py",
     "io/test_antialiased.py",
     "io/test_by_hand.py",
     "io/test_errors.py",

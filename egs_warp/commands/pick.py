@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from egs_warp.commands.scene_input import SceneInput
-    from egs_warp.geometry.camera import Camera
     from egs_warp.io.picked import PickedObject
 
 EXAMPLES = (
@@ -99,7 +98,6 @@ def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
 
     frame, bounds = page_frame(cloud, up=up, plane=scene.plane)
     placed = to_body_frame(cloud, frame)
-    centre = _looked_at(scene.cameras)
     source = PickSource(
         cloud,
         placed,
@@ -108,7 +106,6 @@ def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
         args.out,
         _Commands(args),
         first,
-        None if centre is None else frame.points(centre),
         cameras=scene.cameras,
         film=film,
     )
@@ -138,12 +135,12 @@ def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
 def pick_automatically(args: argparse.Namespace) -> None:
     """Write ``args.out`` with the object of ``--object``, or with the object that the page would propose first.
 
-    Raises ``UserError`` if there is no object in the middle of the capture.
+    Raises ``UserError`` if there is no object in the middle of the capture, or if the proposal is doubtful.
     """
     from egs_warp.commands.scene_input import read_scene
     from egs_warp.io.picked import PickedFile, PickedObject, write_picked
     from egs_warp.io.planes import PlaneRecord
-    from egs_warp.pipelines.pick import edge_warnings, pick_warnings, proposed
+    from egs_warp.pipelines.pick import photo_warnings, pick_warnings, proposed
     from egs_warp.segmentation.interactive import ClickGraph
 
     scene = read_scene(args)
@@ -154,14 +151,18 @@ def pick_automatically(args: argparse.Namespace) -> None:
     else:
         up = _up_of(scene)
         graph = ClickGraph.of(scene.cloud)
-        pick = proposed(graph, up, centre=_looked_at(scene.cameras))
+        pick = proposed(graph, up, cameras=scene.cameras)
         if not pick.mask.any():
             raise UserError(
                 f"{args.capture}: no object was found in the middle of the capture; leave out --yes and pick it on the"
                 " page, or give --object"
             )
-        for warning in (*pick_warnings(graph, pick), *edge_warnings(scene.cloud, pick.mask, scene.cameras)):
-            print_note(f"the object: {warning}; leave out --yes to correct it on the page")
+        doubts = (*pick_warnings(graph, pick), *photo_warnings(scene.cloud, pick.mask, scene.cameras))
+        if doubts:
+            raise UserError(
+                f"{args.capture}: the object that was found is doubtful: {doubts[0]}. Leave out --yes to correct it on"
+                " the page, or give --object"
+            )
         one = PickedObject(pick.name, pick.mask, PlaneRecord(pick.plane), pick.front)
     write_picked(args.out, PickedFile(Path(args.capture).name, (one,)), scene.cloud)
 
@@ -211,17 +212,3 @@ class _Commands:
 
     def view(self, folder: Path) -> list[str]:
         return ["view", str(folder), "--no-browser"]
-
-
-def _looked_at(cameras: Sequence[Camera]) -> np.ndarray | None:
-    """Return the point (3,) that is nearest to the optical axes of all ``cameras``; None for fewer than three."""
-    import numpy as np
-
-    if len(cameras) < 3:
-        return None
-    across = [np.eye(3) - np.outer(camera.rotation[2], camera.rotation[2]) for camera in cameras]
-    centres = [camera.centre for camera in cameras]
-    matrix = np.sum(across, axis=0)
-    if np.linalg.cond(matrix) > 1e6:
-        return None
-    return np.linalg.solve(matrix, np.sum([one @ centre for one, centre in zip(across, centres, strict=True)], axis=0))

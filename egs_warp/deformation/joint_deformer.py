@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -17,16 +18,19 @@ class JointDeformer:
     """Deformer of the clouds of several bodies, each with its own cage, into one cloud. Colour bands that only some of
     the clouds have are zero for the others."""
 
-    def __init__(self, deformers: Sequence[Deformer]) -> None:
+    def __init__(self, deformers: Sequence[Deformer], *, fixed: GaussianCloud | None = None) -> None:
+        """Join the clouds of ``deformers`` and, after them, the cloud ``fixed``, which does not move."""
         self._deformers = tuple(deformers)
-        degree = max(deformer.rest.sh_degree for deformer in deformers)
-        self.rest = concatenate(*(_with_bands(deformer.rest, degree) for deformer in deformers))
+        clouds = [*(deformer.rest for deformer in deformers), *([] if fixed is None else [fixed])]
+        degree = max(cloud.sh_degree for cloud in clouds)
+        self.rest = concatenate(*(_with_bands(cloud, degree) for cloud in clouds))
         """All Gaussians, each in the frame of its own cage."""
         rest = self.rest
         self._deformed = DeformedGaussians(
             replace(rest, **{name: wp.clone(getattr(rest, name)) for name in ARRAYS if name != "opacity_logits"}),
             rotations=empty(rest.count, wp.vec4, rest.device),
         )
+        self._deformed.rotations.fill_(wp.vec4(1.0, 0.0, 0.0, 0.0))
 
     def deform(self, poses: Sequence[np.ndarray]) -> DeformedGaussians:
         """Deform all bodies; ``poses`` are the node positions (N, 3) m of each. The next call overwrites the result."""
@@ -40,7 +44,7 @@ class JointDeformer:
         return deformed
 
 
-def _copy_rows(target: wp.array, source: wp.array, first: int) -> None:
+def _copy_rows(target: Any, source: wp.array, first: int) -> None:
     """Copy the rows of ``source`` into ``target``, beginning at the row ``first``."""
     rows = target[first : first + source.shape[0]]
     wp.copy(rows if rows.ndim == 1 else rows[:, : source.shape[1]], source)
@@ -49,7 +53,7 @@ def _copy_rows(target: wp.array, source: wp.array, first: int) -> None:
 def _with_bands(cloud: GaussianCloud, degree: int) -> GaussianCloud:
     """Return ``cloud`` with the colour bands up to ``degree``, added ones zero."""
     sh = with_degree(cloud, degree).sh.numpy()
-    missing = (degree + 1) ** 2 - sh.shape[1]
+    missing = (degree + 1) ** 2 - (cloud.sh_degree + 1) ** 2
     if missing == 0:
         return cloud
     return replace(cloud, sh=wp.array(np.pad(sh, ((0, 0), (0, missing), (0, 0))), dtype=wp.vec3, device=cloud.device))

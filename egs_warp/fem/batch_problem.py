@@ -56,7 +56,7 @@ class BatchBody:
         )
         self.segments = MuscleSegmentMaps(muscles.difference_rows, muscles.rest_lengths, assembly.device, worlds=count)
         self.mass = torch.as_tensor(body.node_mass, device=self.device)
-        self.gravity, self._difference_rows, self._rest_lengths = (
+        self.gravity, self.difference_rows, self._rest_lengths = (
             torch.as_tensor(np.asarray(values, dtype=np.float64), device=self.device)
             for values in (body.gravity, muscles.difference_rows.toarray(), muscles.rest_lengths)
         )
@@ -79,7 +79,7 @@ class BatchBody:
             tensions: (c, M) N, muscle tensions.
             factor: s^2, multiplies the Hessian.
         """
-        rows, rest_lengths = self._difference_rows, self._rest_lengths
+        rows, rest_lengths = self.difference_rows, self._rest_lengths
         vectors = rows @ positions
         lengths = vectors.norm(dim=2).clamp(min=_MIN_LENGTH)
         directions = vectors / lengths[:, :, None]

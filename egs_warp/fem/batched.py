@@ -7,6 +7,7 @@ PyTorch is not imported here, so that it is not required for one world on a CPU.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
@@ -139,5 +140,54 @@ def as_warp(values: Array, dtype: type) -> wp.array:
     return wp.from_torch(values, dtype=dtype)
 
 
+def as_world(array: wp.array) -> wp.array:
+    """Return ``array`` (n,) with a leading axis of one world, (1, n)."""
+    return array.reshape((1, array.shape[0]))
+
+
 def _array(value: Any) -> Any:
     return as_warp(*value) if isinstance(value, tuple) else value
+
+
+def allocate_struct(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: wp.Device, **arrays: wp.array) -> Any:
+    """Return an instance of a Warp ``struct`` with zeroed arrays on ``device``, of the given ``shapes`` by field, and
+    with the given ``arrays``."""
+    instance = struct()
+    for name, array in (_zeroed_fields(struct, shapes, device) | arrays).items():
+        setattr(instance, name, array)
+    return instance
+
+
+def _zeroed_fields(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: wp.Device) -> dict[str, wp.array]:
+    """Return zeroed arrays of the given ``shapes`` with the element types of the fields of ``struct``."""
+    return {name: wp.zeros(shape, dtype=struct.vars[name].type.dtype, device=device) for name, shape in shapes.items()}
+
+
+class StructPerWorld:
+    """A Warp struct with arrays for each of B worlds, as an array of structs on a device.
+
+    ``structs`` (B,) is the argument of a kernel. The structs hold the addresses of the arrays, so this object must
+    exist as long as they are used.
+    """
+
+    def __init__(
+        self, struct: Any, shapes: Mapping[str, tuple[int, ...]], worlds: int, device: wp.Device, **arrays: wp.array
+    ) -> None:
+        """Allocate zeroed arrays.
+
+        Args:
+            struct: the struct.
+            shapes: shape of each array in one world, by field.
+            worlds: number of worlds B.
+            device: device of the arrays.
+            arrays: arrays that all worlds share, by field.
+        """
+        own = _zeroed_fields(struct, {name: (worlds, *shape) for name, shape in shapes.items()}, device)
+        self._arrays = own | arrays  # The structs hold only addresses.
+        table: Any = np.zeros(worlds, struct.numpy_dtype())
+        for name, array in own.items():
+            table[name] = array[0].__ctype__().numpy_value()
+            table[name]["data"] += np.arange(worlds, dtype=np.uint64) * np.uint64(array.strides[0])
+        for name, array in arrays.items():
+            table[name] = array.__ctype__().numpy_value()
+        self.structs = wp.array(table, dtype=struct, device=device)

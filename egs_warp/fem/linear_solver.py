@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from enum import IntEnum
 from typing import Any, Protocol
@@ -100,3 +101,21 @@ class LinearSolver(Protocol):
             X^T H X (m, m) and X^T g (m,); not finite if there are no factors.
         """
         ...
+
+
+def energy_moves(
+    solve: Callable[[Any], Any], weights: Any, vectors: Any, dt_now: float, dt_ahead: float, reference: Any
+) -> Any:
+    """Return the displacements X (..., n, m) of ``LinearSolver.quadratic_form``.
+
+    Args:
+        solve: function that returns S^-1 times (..., n, m).
+        weights: (n,) w.
+        vectors: (..., n, m) V.
+        dt_now: factor of V.
+        dt_ahead: factor of the solution.
+        reference: (..., n) subtracted from the last column.
+    """
+    moves = dt_now * vectors + dt_ahead * solve(weights[:, None] * vectors)
+    moves[..., -1] -= reference
+    return moves

@@ -48,6 +48,7 @@ class PanelCholesky:
         size = len(upper_pattern.indptr) - 1
         columns = np.repeat(np.arange(size), np.diff(upper_pattern.indptr))
         self._lower = torch.as_tensor(columns * size + upper_pattern.indices.astype(np.int64), device=device)
+        self._upper = torch.as_tensor(upper_pattern.indices.astype(np.int64) * size + columns, device=device)
         self.size, self.panel = size, panel
         self.chunk = max(1, chunk_bytes // (8 * size * size))
         """Number of worlds whose matrices are processed at once."""
@@ -97,6 +98,13 @@ class PanelCholesky:
                 columns[:, stop - start :] = columns[:, stop - start :] @ inverse.mT
         self._factors[select], self._inverses[select] = matrices, inverses
         self.status[select] = torch.where(is_definite, FactorStatus.DEFINITE, FactorStatus.NONE).to(torch.int8)
+
+    def dense(self, entries: torch.Tensor) -> torch.Tensor:
+        """Return the symmetric matrices (k, n, n) with upper ``entries`` (k, nnz) in the order of the pattern."""
+        matrices = entries.new_zeros(len(entries), self.size * self.size)
+        matrices.index_copy_(1, self._lower, entries)
+        matrices.index_copy_(1, self._upper, entries)
+        return matrices.view(-1, self.size, self.size)
 
     def solve(
         self, right: torch.Tensor, select: torch.Tensor, projection: MomentumProjection[torch.Tensor] | None = None

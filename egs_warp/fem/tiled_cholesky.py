@@ -16,7 +16,7 @@ import warp as wp
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphStream
 from egs_warp.fem.dissection import Dissection
-from egs_warp.fem.linear_solver import FactorStatus
+from egs_warp.fem.linear_solver import FactorStatus, energy_moves
 from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.fem.tile_tasks import TileTaskGraph
 from egs_warp.kernels.fem import triangles as kernels
@@ -238,11 +238,10 @@ class TiledCholesky:
         reference: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Queue ``quadratic_form`` of device tensors, without synchronization."""
-        moves = dt_now * vectors + dt_ahead * self.enqueue_solve(weights[:, None] * vectors)
-        moves[:, -1] -= reference
         flat = self._energy_hessian.view(-1)
         flat[self._upper] = entries
         flat[self._lower] = entries
+        moves = energy_moves(self.enqueue_solve, weights, vectors, dt_now, dt_ahead, reference)
         return moves.T @ (self._energy_hessian @ moves), gradient @ moves
 
     def _to_device(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
@@ -55,6 +56,15 @@ class BodyFrame:
             self.points(field.origin),
             self.scale * field.spacing,
             self.scale * field.coefficients,
+        )
+
+    def camera(self, camera: Camera) -> Camera:
+        """Transform a ``camera`` of the capture to the body's frame."""
+        return replace(
+            camera,
+            rotation=camera.rotation @ self.axes.T,
+            translation=self.scale * (camera.rotation @ self.origin + camera.translation),
+            near=self.scale * camera.near,
         )
 
     def scaled(self, factor: float) -> BodyFrame:

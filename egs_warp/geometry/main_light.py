@@ -45,6 +45,11 @@ def mean_irradiance(light: MainLight) -> float:
     return float(light.irradiance[3, 3] + np.trace(light.irradiance[:3, :3]) / 3.0)
 
 
+def normalised(light: MainLight) -> MainLight:
+    """Return the light with a mean irradiance of 1 over all normals."""
+    return replace(light, irradiance=light.irradiance / mean_irradiance(light))
+
+
 def irradiance_form(ambient: float, slope: float, up: np.ndarray, key: float, direction: np.ndarray) -> np.ndarray:
     """Return the quadratic form (4, 4) of the irradiance from an ambient light and a distant light.
 

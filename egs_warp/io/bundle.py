@@ -13,7 +13,7 @@ import numpy as np
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.bundle_arrays import PackedArray, indices, quantised
-from egs_warp.io.bundle_file import BAND_ZERO, HEAD, MAGIC, VERSION, Carrier, read_valid_file
+from egs_warp.io.bundle_file import BYTE_ZERO, HEAD, MAGIC, VERSION, Carrier, read_valid_file
 from egs_warp.io.raw import logits_from_opacities
 from egs_warp.version import __version__
 
@@ -25,6 +25,8 @@ steps. Finer steps would only store noise that cannot be compressed, which would
 _ROTATION_STEP, _SCALE_STEP, _COLOUR_STEP, _ARM_STEP = 1.0 / 512.0, 1.0 / 128.0, 1.0 / 512.0, 1.0 / 4096.0
 """Quantisation steps of rotation vectors (rad), log scales, colours, and bulges and lengths of arms (standard
 deviations)."""
+_NORMAL_STEP = 1.0 / 127.0
+"""Quantisation step of normals."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,9 @@ class BundleBody:
     """The n Gaussians at rest, after splitting."""
     cage: BundleCage | None = None
     """Cage of the splats; None for static splats, such as the rest of a scene."""
+    normals: np.ndarray | None = None
+    """(n, 3) unit normals of the surface at rest, zero where there is none; None if the colours do not change with the
+    main light."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,7 @@ class Bundle:
     """Number of frames of every cage."""
     facts: Mapping[str, Any]
     """Other properties of the JSON text: ``title``, ``licence``, ``up``, ``metres_per_unit``, ``height``, ``front``,
-    ``flat_ground``, ``camera``, ``capture``."""
+    ``flat_ground``, ``camera``, ``capture``, ``light``."""
 
 
 def write_bundle(path: Path, bundle: Bundle) -> None:
@@ -113,6 +118,8 @@ def bundle_file(bundle: Bundle) -> bytes:
         if cage is not None:
             facts |= {"max_stretch": cage.max_stretch}
         arrays = {**({} if cage is None else _cage_arrays(cage)), **_splat_arrays(body.splats)}
+        if body.normals is not None:
+            arrays["normals"] = quantised(body.normals, np.uint8, step=_NORMAL_STEP, lower=-BYTE_ZERO * _NORMAL_STEP)
         bodies.append({**facts, "arrays": stored(arrays)})
     moving = [(facts, body.cage) for facts, body in zip(bodies, bundle.bodies, strict=True) if body.cage is not None]
     for facts, _ in moving:
@@ -169,7 +176,8 @@ def read_bundle(path: Path) -> Bundle:
                 max_stretch=body["max_stretch"],
                 nodes=nodes,
             )
-        bodies.append(BundleBody(body["name"], _cloud(numbers, body["antialiased"]), cage))
+        normals = numbers.get("normals")
+        bodies.append(BundleBody(body["name"], _cloud(numbers, body["antialiased"]), cage, normals))
     return Bundle(tuple(bodies), file.text["rate"], file.text["frames"], facts)
 
 
@@ -188,8 +196,8 @@ def _splat_arrays(cloud: GaussianCloud) -> dict[str, PackedArray]:
     }
     if cloud.sh_degree > 0:
         bands = sh[:, 1:].transpose(0, 2, 1)
-        step = np.maximum(np.abs(bands).max(axis=(0, 1)) / (BAND_ZERO - 1), _BAND_STEP)
-        arrays["bands"] = quantised(bands, np.uint8, step=step, lower=-BAND_ZERO * step)
+        step = np.maximum(np.abs(bands).max(axis=(0, 1)) / (BYTE_ZERO - 1), _BAND_STEP)
+        arrays["bands"] = quantised(bands, np.uint8, step=step, lower=-BYTE_ZERO * step)
     return arrays
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.io.bundle_arrays import PackedArray
 from egs_warp.io.limits import MAX_COORDINATE, MAX_TEXT_BYTES, read_bytes
+from egs_warp.io.planes import light_from_json
 
 MAGIC = b"EGSB"
 """First bytes of a bundle."""
@@ -24,8 +25,9 @@ VERSION = 1
 """Version of the format."""
 HEAD = struct.Struct("<4sII")
 """Magic bytes, version, and length of the JSON text in bytes."""
-BAND_ZERO = 128
-"""Stored value of a zero SH coefficient above band 0."""
+BYTE_ZERO = 128
+"""Stored value of a zero in the arrays that a player reads in their stored form: SH coefficients above band 0, and
+normals."""
 _ROUNDING = 1.0 + 1e-3
 """Maximum ratio of a stated error to half a step; above 1, because steps are rounded to double precision."""
 _INDICES = ("cage_tets", "surface", "tets", "carriers", "arm_tets")
@@ -91,6 +93,11 @@ def _read(data: bytes) -> tuple[BundleFile | None, list[str]]:
     if len(payload) != text["bytes"]:
         problems.append(f"the data have {len(payload)} bytes, but the JSON text states {text['bytes']}")
     problems += _order_problems(text)
+    if "light" in text:
+        try:
+            light_from_json(text["light"])
+        except ValueError as error:
+            problems.append(str(error))
     end = 0
     stored: dict[str, PackedArray] = {}
     # Read the arrays in the order of the file, in which a player receives them.
@@ -187,6 +194,8 @@ def _body_problems(
     expected |= {"opacities": (count,), "colours": (count, 3)}
     if body["degree"] > 0:
         expected["bands"] = (count, 3, (body["degree"] + 1) ** 2 - 1)
+    if "normals" in arrays:
+        expected["normals"] = (count, 3)
     if "blocks" in body:
         nodes, tets = (len(arrays[name].stored) for name in ("rest_nodes", "cage_tets"))
         arms = int(np.count_nonzero(arrays["carriers"].stored == Carrier.ARMS))
@@ -195,12 +204,12 @@ def _body_problems(
         expected |= {name: (arms, 6) for name in ("arm_tets", "arm_shares", "arm_lengths")}
     wrong = [name for name, shape in expected.items() if arrays[name].stored.shape != shape]
     yield from (f"{name} has shape {list(arrays[name].stored.shape)}, not {list(expected[name])}" for name in wrong)
-    if "bands" in expected and not wrong:
-        bands = arrays["bands"]
-        if bands.stored.dtype != np.uint8 or bands.step is None or bands.lower is None:
-            yield "bands are not uint8 with a step"
-        elif not np.allclose(bands.lower, -BAND_ZERO * bands.step, rtol=1e-6):
-            yield f"lower of bands is not {-BAND_ZERO} steps"
+    for name in {"bands", "normals"} & expected.keys() if not wrong else ():
+        array = arrays[name]
+        if array.stored.dtype != np.uint8 or array.step is None or array.lower is None:
+            yield f"{name} are not uint8 with a step"
+        elif not np.allclose(array.lower, -BYTE_ZERO * array.step, rtol=1e-6):
+            yield f"lower of {name} is not {-BYTE_ZERO} steps"
     if wrong or "blocks" not in body:
         return
     limits = {"cage_tets": nodes, "surface": nodes, "tets": tets, "carriers": len(Carrier)}

@@ -102,7 +102,7 @@ class PlaneRecord:
         if self.ground is not None:
             facts["ground"] = _ground_to_json(self.ground)
         if self.light is not None:
-            facts["light"] = _light_to_json(self.light)
+            facts["light"] = light_to_json(self.light)
         return {"normal": self.plane.normal.tolist(), "offset": self.plane.offset, **facts, **self.others}
 
     @classmethod
@@ -129,7 +129,7 @@ class PlaneRecord:
                 pixels=int(entry["pixels"]) if "pixels" in entry else None,
                 hole=HoleOutline.from_json(entry["hole"], path) if "hole" in entry else None,
                 ground=_ground_from_json(entry["ground"], path) if "ground" in entry else None,
-                light=_light_from_json(entry["light"], path) if "light" in entry else None,
+                light=_light_of_entry(entry["light"], path) if "light" in entry else None,
                 others={name: value for name, value in entry.items() if name not in ("normal", "offset", *_FACTS)},
             )
         except (TypeError, ValueError, OverflowError) as error:
@@ -164,7 +164,8 @@ def _ground_from_json(entry: Any, path: Path) -> HeightField:
     return ground
 
 
-def _light_to_json(light: MainLight) -> dict[str, Any]:
+def light_to_json(light: MainLight) -> dict[str, Any]:
+    """Return the JSON object of a light, as ``plane.json``, bundles and pages store it."""
     return {
         "direction": light.direction.tolist(),
         "half_angle": light.half_angle,
@@ -173,8 +174,8 @@ def _light_to_json(light: MainLight) -> dict[str, Any]:
     }
 
 
-def _light_from_json(entry: Any, path: Path) -> MainLight:
-    """Inverse of ``_light_to_json``. Raises ``UserError`` for invalid data."""
+def light_from_json(entry: Any) -> MainLight:
+    """Inverse of ``light_to_json``. Raises ``ValueError`` for invalid data."""
     try:
         light = MainLight(
             np.array(entry["direction"], dtype=float).reshape(3),
@@ -182,10 +183,18 @@ def _light_from_json(entry: Any, path: Path) -> MainLight:
             float(entry["shade"]),
             np.array(entry["irradiance"], dtype=float).reshape(4, 4),
         )
-        check_light(light)
     except (TypeError, KeyError, ValueError, OverflowError, AttributeError) as error:
-        raise UserError(f"{path}: its light is damaged; make it again with egs-warp segment") from error
+        raise ValueError("the light is invalid") from error
+    check_light(light)
     return light
+
+
+def _light_of_entry(entry: Any, path: Path) -> MainLight:
+    """Return the light of an entry of ``planes``. Raises ``UserError`` for invalid data."""
+    try:
+        return light_from_json(entry)
+    except ValueError as error:
+        raise UserError(f"{path}: its light is damaged; make it again with egs-warp segment") from error
 
 
 _NUMBERS = ("size", "noise", "inlier_share", "support")

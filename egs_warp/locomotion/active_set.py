@@ -7,17 +7,16 @@ The method is the dual active-set method of Goldfarb and Idnani (1983), started 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 import warp as wp
 from scipy.linalg import get_lapack_funcs
 
+from egs_warp.fem.batched import allocate_struct
 from egs_warp.kernels.locomotion import quadratic_program as kernels
 from egs_warp.kernels.locomotion.active_set import INFEASIBLE, NUMERICAL_FAILURE, ActiveSet, UnitConstraints
-from egs_warp.launching import device_of, launch_cached, round_up, thread_local_cache
-from egs_warp.precision import real
+from egs_warp.launching import launch_cached, round_up, thread_local_cache
 
 (_trtri,) = get_lapack_funcs(("trtri",), dtype=np.float64)
 _ROW_STEP = 32
@@ -104,7 +103,9 @@ class _Workspace:
     def __init__(self, rows: int, unknowns: int) -> None:
         self._device, self._unknowns = wp.get_device("cpu"), unknowns
         never, self._ended = (wp.zeros(count, dtype=int, device=self._device) for count in (1, 2))
-        self._rows, self._state = active_set_arrays(rows, rows, unknowns, never)
+        row_shapes, state_shapes = active_set_shapes(rows, rows, unknowns)
+        self._rows = allocate_struct(UnitConstraints, row_shapes, self._device, cancelled=never)
+        self._state = allocate_struct(ActiveSet, state_shapes, self._device)
         names = ("values_at_origin", "lower", "upper", "slack")
         self._bounds = [getattr(self._rows, name).numpy() for name in names]
         self._units, self._side, self._status = (
@@ -156,29 +157,28 @@ def _workspace_for(A: np.ndarray) -> _Workspace:
     return _thread_workspace(round_up(len(A), _ROW_STEP), A.shape[1])
 
 
-def active_set_arrays(rows: int, base_rows: int, unknowns: int, cancelled: wp.array) -> tuple[Any, Any]:
-    """Allocate ``UnitConstraints`` and ``ActiveSet`` on the device of ``cancelled``.
+def active_set_shapes(rows: int, base_rows: int, unknowns: int) -> tuple[dict[str, tuple[int, ...]], ...]:
+    """Return the shapes of the arrays of ``UnitConstraints``, without ``cancelled``, and of ``ActiveSet``.
 
     Args:
         rows: row capacity.
         base_rows: number of base rows; each row is a combination of them.
         unknowns: maximum number of unknowns.
-        cancelled: (1,) int32; the iterations end when it is set.
     """
-    zeros = partial(wp.zeros, device=device_of(cancelled))
-    units, active_set = UnitConstraints(), ActiveSet()
-    units.cancelled = cancelled
-    units.units, units.base_values = zeros((base_rows, unknowns), dtype=real), zeros(base_rows, dtype=real)
-    units.base_rows, units.coefficients = zeros((rows, 3), dtype=int), zeros((rows, 3), dtype=real)
-    for name in ("values_at_origin", "lower", "upper", "slack"):
-        setattr(units, name, zeros(rows, dtype=real))
-    active_set.side, active_set.active = zeros(rows, dtype=int), zeros(unknowns, dtype=int)
-    for name in ("active_rows", "active_columns", "products", "root", "inverse"):
-        setattr(active_set, name, zeros((unknowns, unknowns), dtype=real))
-    active_set.values = zeros(rows, dtype=real)
-    for name in ("multipliers", "z", "dual_direction", "scratch_a", "scratch_b", "entering_row", "orthogonal_part"):
-        setattr(active_set, name, zeros(unknowns, dtype=real))
-    return units, active_set
+    square = "active_rows", "active_columns", "products", "root", "inverse"
+    vectors = "multipliers", "z", "dual_direction", "scratch_a", "scratch_b", "entering_row", "orthogonal_part"
+    return (
+        {
+            **{"units": (base_rows, unknowns), "base_values": (base_rows,)},
+            **dict.fromkeys(("base_rows", "coefficients"), (rows, 3)),
+            **dict.fromkeys(("values_at_origin", "lower", "upper", "slack"), (rows,)),
+        },
+        {
+            **{"side": (rows,), "active": (unknowns,), "values": (rows,)},
+            **dict.fromkeys(square, (unknowns, unknowns)),
+            **dict.fromkeys(vectors, (unknowns,)),
+        },
+    )
 
 
 def solve_from_guess(

@@ -23,10 +23,11 @@ class Audit:
     energy_residual: float
     """Residual of the energy balance, divided by m g H."""
     cone_violation: float
-    """Force outside the friction cone, divided by m g."""
+    """Force outside the friction cone, divided by m g, for contacts with the ground and solids. ``world_audit`` audits
+    the contacts between bodies."""
     friction_gap: float
     """Difference between the actual work of friction and the work of a friction force at its bound that opposes the
-    slip, divided by m g H. Contacts with other bodies are not included, because their slip is relative to that body."""
+    slip, divided by m g H, for contacts with the ground and solids."""
     contact_velocity: float
     """Difference between the stored end velocities of loaded contacts and their displacements per time step, divided by
     sqrt(g H)."""
@@ -50,12 +51,12 @@ def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton
     """
     t = trajectory
     unit = t.node_mass.sum() * np.linalg.norm(t.gravity) * t.height
-    linear, angular = _momentum_residuals(t)
+    linear, angular = momentum_residuals(t)
     normals = _contact_normals(t)
     normal = np.einsum("ci,ci->c", t.contact_force, normals)
     tangential = t.contact_force - normal[:, None] * normals
     friction_forces = np.linalg.norm(tangential, axis=1)
-    by_velocities, displacements = _contact_displacements(t)
+    by_velocities, displacements = contact_displacements(t)
     along = np.einsum("ci,ci->c", displacements, normals)
     slip = displacements - along[:, None] * normals
     # Coulomb: mu f_n |slip| + f_t . slip is never negative, and zero if friction is at its bound and opposes the slip,
@@ -71,7 +72,7 @@ def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton
         angular_momentum_residual=float(np.linalg.norm(angular, axis=1).max(initial=0.0) / unit),
         energy_residual=energy.max_residual,
         cone_violation=float(
-            np.maximum(friction_forces - t.friction * normal, -normal).max(initial=0.0) * t.height / unit
+            np.maximum(friction_forces - t.friction * normal, -normal)[fixed].max(initial=0.0) * t.height / unit
         ),
         friction_gap=float(friction_gap[fixed].max(initial=0.0) / unit),
         contact_velocity=float(
@@ -84,7 +85,7 @@ def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton
     )
 
 
-def _momentum_residuals(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+def momentum_residuals(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Return the residuals of the momentum balances of F steps, (F, 3) N linear and (F, 3) N m angular: rate of change
     of the momentum minus external forces or torques."""
     mass = t.node_mass.sum()
@@ -94,7 +95,7 @@ def _momentum_residuals(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     spin = np.einsum("n,fni->fi", t.node_mass, np.cross(arms, t.velocities))
     force, torque = np.zeros((len(t.dt), 3)), np.zeros((len(t.dt), 3))
     np.add.at(force, t.contact_step, t.contact_force)
-    np.add.at(torque, t.contact_step, np.cross(_start_points(t) - com[t.contact_step], t.contact_force))
+    np.add.at(torque, t.contact_step, np.cross(start_points(t) - com[t.contact_step], t.contact_force))
     if len(t.kick_step):
         impulses = t.node_mass[:, None] * t.kick_velocity / t.dt[t.kick_step, None, None]
         np.add.at(force, t.kick_step, impulses.sum(axis=1))
@@ -107,16 +108,16 @@ def _momentum_residuals(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     return linear, np.diff(spin, axis=0) / dt - torque + drag_torque
 
 
-def _start_points(t: Trajectory) -> np.ndarray:
+def start_points(t: Trajectory) -> np.ndarray:
     """Return (C, 3) m, positions of the contacts at the start of their steps."""
     return np.einsum("cw,cwi->ci", t.contact_weights, t.positions[t.contact_step[:, None], t.contact_nodes])
 
 
 def _start_gaps(t: Trajectory) -> np.ndarray:
     """Return (C,) m, distance of each contact from its plane, or from the tangent plane of uneven ground, at the start
-    of its step."""
+    of its step; for contacts with other bodies, a value without meaning."""
     planes = t.planes[np.maximum(t.contact_plane, 0)]
-    points = _start_points(t)
+    points = start_points(t)
     gaps = np.einsum("ci,ci->c", planes[:, :3], points) + planes[:, 3]
     uneven = _on_uneven_ground(t)
     gaps[uneven] = _ground_gaps(t, points[uneven])
@@ -131,7 +132,7 @@ def _on_uneven_ground(t: Trajectory) -> np.ndarray:
 def _contact_normals(t: Trajectory) -> np.ndarray:
     """Return (C, 3) unit normals of the contacts: recomputed from the heights on uneven ground, else as stored."""
     normals, uneven = t.contact_normal.copy(), _on_uneven_ground(t)
-    normals[uneven] = _ground(t, _start_points(t)[uneven])[1]
+    normals[uneven] = _ground(t, start_points(t)[uneven])[1]
     return normals
 
 
@@ -168,10 +169,10 @@ def _ground(t: Trajectory, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return height(0.0, 0.0), normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
-def _contact_displacements(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+def contact_displacements(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Return the displacement of each contact in its step twice, (C, 3) m: computed from the stored end velocities, and
     from the positions."""
     after = t.contact_step + 1
     velocities = np.einsum("cw,cwi->ci", t.contact_weights, t.velocities[after[:, None], t.contact_nodes])
     ends = np.einsum("cw,cwi->ci", t.contact_weights, t.positions[after[:, None], t.contact_nodes])
-    return t.dt[t.contact_step, None] * velocities, ends - _start_points(t)
+    return t.dt[t.contact_step, None] * velocities, ends - start_points(t)

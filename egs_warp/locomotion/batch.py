@@ -1,13 +1,13 @@
-"""Steps of many worlds of one body in lockstep on one device, each under prescribed activations.
+"""Steps of many worlds of one body in lockstep on one device, with planned or with prescribed activations.
 
-For each world, ``BatchStepper.advance`` solves the same equations and makes the same decisions as
-``LocomotionStepper.advance_with_activations``, with kernels over all worlds and batched matrix products.
+For each world, ``BatchStepper`` solves the same equations and makes the same decisions as ``LocomotionStepper`` with
+the QP solver ``admm``, with kernels over all worlds and batched matrix products.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,59 +17,28 @@ from egs_warp.contact.batch_step import BatchInputs, BatchLinearization, BatchRe
 from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.detection import ContactDetector, ContactGeometry
 from egs_warp.contact.selection import ContactSelector
+from egs_warp.errors import ArgumentError
 from egs_warp.fem.batch_problem import BatchBody, BatchProblem, apply_inverse
-from egs_warp.fem.batched import BatchedRecord, nonzero, padded
+from egs_warp.fem.batched import nonzero, padded
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.panel_cholesky import CHUNK_BYTES, PANEL
+from egs_warp.locomotion.batch_objectives import BatchObjectives
+from egs_warp.locomotion.batch_plan import BatchPlan, BatchPlanner, BatchPrediction
+from egs_warp.locomotion.batch_state import BatchState, BatchStep, merged
 from egs_warp.locomotion.linear_step import PREDICTION_ITERATIONS
+from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.planner import StepPlanner
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.settling import SETTLING_STEP, SETTLING_STEPS, has_settled
-from egs_warp.locomotion.stepper import MAX_HALVINGS, StepReport, WarmStart
+from egs_warp.locomotion.stepper import (
+    MAX_HALVINGS,
+    REPLAN_FACTOR,
+    REPLAN_MARGIN,
+    StepReport,
+    WarmStart,
+)
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.render.autograd import torch_stream
-
-
-@dataclass(frozen=True)
-class BatchState(BatchedRecord):
-    """State of c worlds and the warm start of their next step."""
-
-    worlds: torch.Tensor
-    """(c,) int64, ascending indices of these worlds among all worlds of the stepper."""
-    positions: torch.Tensor
-    """(c, N, 3) m, nodal positions."""
-    velocities: torch.Tensor
-    """(c, N, 3) m/s, nodal velocities."""
-    time: torch.Tensor
-    """(c,) s, time since the start of the simulation."""
-    points: torch.Tensor
-    """(c, K) int32, contact points in use; each world uses the first ``counts`` of the K slots."""
-    counts: torch.Tensor
-    """(c,) int32, number of contact points in use."""
-    forces: torch.Tensor
-    """(c, K, 3) N, contact forces in the axes of each contact."""
-
-
-@dataclass(frozen=True)
-class BatchStep(BatchedRecord):
-    """Result of one step of c worlds, on the device."""
-
-    after: BatchState
-    """State at the end of the step."""
-    report: StepReport
-    """Report of all worlds, with tensors that have a leading world axis, and without timings."""
-
-    @property
-    def worlds(self) -> torch.Tensor:
-        """(c,) int64, ascending, worlds that made this step."""
-        return self.after.worlds
-
-    def reports(self) -> list[StepReport]:
-        """Download the step; return one report for each of ``worlds``, in the form of ``LocomotionStepper``."""
-        reports, counts = self.report.download(), self.after.counts.tolist()
-        return [
-            replace(report, forces=report.forces[:count], end_gaps=report.end_gaps[:count])
-            for report, count in zip(reports, counts, strict=True)
-        ]
 
 
 class BatchStepper:
@@ -89,6 +58,7 @@ class BatchStepper:
         panel: int = PANEL,
         chunk_bytes: int = CHUNK_BYTES,
         stages: StageTimer = no_timer,
+        planner: StepPlanner | None = None,
     ) -> None:
         """Allocate the buffers that all steps share. The factors take 72 N^2 bytes for each world.
 
@@ -102,6 +72,11 @@ class BatchStepper:
             chunk_bytes: maximum total size, in bytes, of the matrices that are factored at a time. The temporary memory
                 takes several times as much in addition.
             stages: timer of the stages of a step.
+            planner: planner of a single world of the same body and settings, which ``advance`` requires
+                (``LocomotionStepper.planner``).
+
+        Raises:
+            UserError: The strategy of the settings of ``planner`` does not run in batches.
         """
         self.settings = settings or LocomotionSettings()
         self.device = torch.device(str(body.assembly.device))
@@ -121,6 +96,7 @@ class BatchStepper:
         )
         self._stages = stages
         self._frictions, self._stiffness = self._tensor(frictions), self._tensor(muscles.stiffness)
+        self._planner = BatchPlanner(planner, self.common, count, stages) if planner is not None else None
 
     def _tensor(self, values: Sequence[float] | np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.asarray(values, dtype=np.float64), device=self.device)
@@ -135,9 +111,9 @@ class BatchStepper:
         count = len(self._frictions)
         capacity = max((len(memory.points) for memory in memories or ()), default=0)
         points, forces = np.zeros((count, capacity), np.int32), np.zeros((count, capacity, 3))
-        counts = np.zeros(count, np.int32)
+        counts, activations = np.zeros(count, np.int32), np.zeros((count, self.muscles.segment_count))
         for world, memory in enumerate(memories or ()):
-            counts[world] = len(memory.points)
+            counts[world], activations[world] = len(memory.points), memory.activations
             points[world, : counts[world]], forces[world, : counts[world]] = memory.points, memory.forces
         return BatchState(
             torch.arange(count, device=self.device),
@@ -147,6 +123,7 @@ class BatchStepper:
             torch.as_tensor(points, device=self.device),
             torch.as_tensor(counts, device=self.device),
             self._tensor(forces),
+            self._tensor(activations),
         )
 
     def settle(self) -> tuple[list[BodyState], torch.Tensor]:
@@ -185,11 +162,39 @@ class BatchStepper:
         contacts, result = self.solver.solve(inputs, response, velocities=velocities, forces=previous_forces)
         after = BatchState(
             *(state.worlds, problem.end_positions(result.velocities), torch.zeros_like(velocities), state.time),
-            *(contacts.points, contacts.counts, result.forces),
+            *(contacts.points, contacts.counts, result.forces, state.activations),
         )
         return after, dt * result.velocities.abs().flatten(1).amax(dim=1), failed | result.is_singular
 
     def advance(
+        self, state: BatchState, objectives: Sequence[Sequence[AnyObjective]] | BatchObjectives, dt: float
+    ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
+        """Make one step of ``dt`` seconds with planned activations; see ``LocomotionStepper.advance``.
+
+        Args:
+            state: worlds to step.
+            objectives: objectives on the end of the step of each of these worlds.
+            dt: step size, s.
+
+        Returns:
+            As for ``advance_with_activations``.
+        """
+        with torch.no_grad(), torch_stream(self.device):
+            if not isinstance(objectives, BatchObjectives):
+                objectives = BatchObjectives.stack(objectives, len(self.common.mass), self.device)
+            step, failed = self._planned_step(state, objectives, dt)
+            repeated = nonzero(~step.report.converged & ~failed)
+            if len(repeated) == 0:
+                solved = nonzero(~failed)
+                return self._solved(state, step.after.subset(solved), [step.subset(solved)], failed)
+            solved = nonzero(step.report.converged & ~failed)
+            start = state.gather(repeated)
+            planned = torch.as_tensor(step.report.activations)[repeated]
+            after, done, half_failed = self._best_half_steps(start, planned, objectives.subset(repeated), dt)
+            failed[repeated[half_failed]] = True
+            return self._solved(state, merged(step.after.subset(solved), after), [step.subset(solved), *done], failed)
+
+    def advance_with_activations(
         self, state: BatchState, activations: np.ndarray | torch.Tensor, dt: float
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
         """Make one step of ``dt`` seconds. Where it does not converge, make shorter steps instead.
@@ -201,22 +206,34 @@ class BatchStepper:
 
         Returns:
             The state of the solved worlds; their steps in chronological order; and (c,) bool, True for failed worlds of
-            ``state``: a tangent could not be factored, or no part of the step converged.
+            ``state``: a matrix could not be factored, or no part of the step converged.
         """
         with torch.no_grad(), torch_stream(self.device):
             on_device = torch.as_tensor(activations, dtype=torch.float64, device=self.device)
-            after, done, failed = self._parts(state, on_device, dt, MAX_HALVINGS)
-            solved = torch.zeros(len(self._frictions), dtype=torch.bool, device=self.device)
-            for step in done:
-                solved[step.worlds] |= step.report.converged
-            failed |= ~solved[state.worlds]
-            solved[state.worlds[failed]] = False
-            solved_steps = [step.subset(nonzero(solved[step.worlds])) for step in done]
-            return (
-                after.subset(nonzero(solved[after.worlds])),
-                [step for step in solved_steps if len(step.worlds) > 0],
-                failed,
-            )
+            return self._solved(state, *self._parts(state, on_device, dt, MAX_HALVINGS))
+
+    def _solved(
+        self, state: BatchState, after: BatchState, done: list[BatchStep], failed: torch.Tensor
+    ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
+        """Return the result of ``advance_with_activations``: remove the worlds in which no part of the step converged.
+
+        Args:
+            state: worlds at the start.
+            after: state of the worlds that have not failed.
+            done: their steps.
+            failed: (c,) bool, True for failed worlds.
+        """
+        solved = torch.zeros(len(self._frictions), dtype=torch.bool, device=self.device)
+        for step in done:
+            solved[step.worlds] |= step.report.converged
+        failed = failed | ~solved[state.worlds]
+        solved[state.worlds[failed]] = False
+        solved_steps = [step.subset(nonzero(solved[step.worlds])) for step in done]
+        return (
+            after.subset(nonzero(solved[after.worlds])),
+            [step for step in solved_steps if len(step.worlds) > 0],
+            failed,
+        )
 
     def _parts(
         self, state: BatchState, activations: torch.Tensor, dt: float, max_halvings: int
@@ -234,14 +251,63 @@ class BatchStepper:
             solved = nonzero(~failed)
             return step.after.subset(solved), [step.subset(solved)], failed
         solved = nonzero(converged & ~failed)
-        done, after = [step.subset(solved)], step.after.subset(solved)
-        half, rows, half_activations = state.gather(repeated), repeated, activations[repeated]
+        half, done, half_failed = self._half_steps(state.gather(repeated), activations[repeated], dt, max_halvings)
+        failed[repeated[half_failed]] = True
+        return merged(step.after.subset(solved), half), [step.subset(solved), *done], failed
+
+    def _half_steps(
+        self, state: BatchState, activations: torch.Tensor, dt: float, max_halvings: int
+    ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
+        """Make two steps of ``dt`` / 2 seconds, which are halved again where they do not converge; results as of
+        ``_parts``."""
+        done: list[BatchStep] = []
+        failed = torch.zeros(len(state.worlds), dtype=torch.bool, device=self.device)
+        rows = torch.arange(len(state.worlds), device=self.device)
         for _ in range(2):
-            half, parts, half_failed = self._parts(half, half_activations, 0.5 * dt, max_halvings - 1)
+            state, parts, part_failed = self._parts(state, activations, 0.5 * dt, max_halvings - 1)
             done += parts
-            failed[rows[half_failed]] = True
-            rows, half_activations = rows[~half_failed], half_activations[~half_failed]
-        return _merged(after, half), done, failed
+            failed[rows[part_failed]] = True
+            rows, activations = rows[~part_failed], activations[~part_failed]
+        return state, done, failed
+
+    def _best_half_steps(
+        self, state: BatchState, planned: torch.Tensor, objectives: BatchObjectives, dt: float
+    ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
+        """Make half steps with the ``planned`` activations (c, M), m, and with the activations of the last step. Return
+        the better result of each world, as ``LocomotionStepper.advance`` does; a world fails if it fails in either.
+        """
+        results = [
+            self._half_steps(state, activations, dt, MAX_HALVINGS) for activations in (planned, state.activations)
+        ]
+        (unconverged, value), (other_unconverged, other_value) = (
+            self._rank_half_steps(state, done, objectives) for _, done, _ in results
+        )
+        failed = results[0][2] | results[1][2]
+        is_second = torch.where(unconverged == other_unconverged, other_value < value, unconverged)
+        parts: list[tuple[BatchState, list[BatchStep]]] = []
+        for choice, (after, done, _) in zip((~is_second, is_second), results, strict=True):
+            chosen = state.worlds[choice & ~failed]
+            steps = [step.subset(nonzero(torch.isin(step.worlds, chosen))) for step in done]
+            parts.append((after.subset(nonzero(torch.isin(after.worlds, chosen))), steps))
+        (one, steps), (other, other_steps) = parts
+        return merged(one, other), [step for step in [*steps, *other_steps] if len(step.worlds) > 0], failed
+
+    def _rank_half_steps(
+        self, state: BatchState, done: list[BatchStep], objectives: BatchObjectives
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (c,) bool, True where a step of ``done`` did not converge, and (c,), the objective value at the end of
+        the last step. ``state`` is the state before these steps."""
+        positions, velocities = state.positions.clone(), state.velocities.clone()
+        unconverged = torch.zeros(len(state.worlds), dtype=torch.bool, device=self.device)
+        value = torch.zeros(len(state.worlds), dtype=torch.float64, device=self.device)
+        for step in done:
+            rows, after, dt = torch.searchsorted(state.worlds, step.worlds), step.after, step.report.dt
+            problem = BatchProblem.at(self.common, step.worlds, positions[rows], velocities[rows], dt=dt)
+            ends = after.velocities, after.forces
+            value[rows] = objectives.subset(rows).value(problem, step.report.contacts, *ends)
+            unconverged[rows] |= ~torch.as_tensor(step.report.converged)
+            positions[rows], velocities[rows] = after.positions, after.velocities
+        return unconverged, value
 
     def _step(self, state: BatchState, activations: torch.Tensor, dt: float) -> tuple[BatchStep, torch.Tensor]:
         """Make one step of all worlds, as ``LocomotionStepper.step_with_activations`` does. Also return (c,) bool, True
@@ -253,6 +319,84 @@ class BatchStepper:
         failed |= result.is_singular
         result = replace(result, converged=result.converged & ~failed)
         return self._finish(inputs, contacts, result, state, activations), failed
+
+    def _planned_step(
+        self, state: BatchState, objectives: BatchObjectives, dt: float
+    ) -> tuple[BatchStep, torch.Tensor]:
+        """Make one step of all worlds with planned activations, as ``LocomotionStepper.step`` does. Also return (c,)
+        bool, True where a matrix could not be factored."""
+        if self._planner is None:
+            raise ArgumentError("planner", "give BatchStepper the planner of a LocomotionStepper to step by objectives")
+        with self._stages("detect"):
+            inputs, previous_forces = self._start(state, self._stiffness * state.activations, dt, self.settings.drag)
+        response, velocities, forces, failed = self._predict(inputs, previous_forces)
+        predicted = BatchPrediction(response, state.activations, velocities, forces)
+        plan = self._planner.plan(inputs, predicted, state.activations, objectives)
+        expected = objectives.value(inputs.problem, inputs.contacts, plan.velocities, plan.forces)
+        contacts, result = self._solve_plan(inputs, response, plan)
+        failed |= plan.failed | result.is_singular
+        value = objectives.value(inputs.problem, contacts, result.velocities, result.forces)
+        worlds = nonzero(result.converged & ~failed & (value > REPLAN_FACTOR * expected + REPLAN_MARGIN))
+        if len(worlds) > 0:
+            contacts, result, plan = self._replan(
+                worlds, inputs, (contacts, result, plan), state.activations, objectives, value
+            )
+            failed |= plan.failed | result.is_singular
+        result = replace(result, converged=result.converged & ~failed)
+        return self._finish(inputs, contacts, result, state, plan.activations, plan), failed
+
+    def _solve_plan(
+        self, inputs: BatchInputs, response: BatchLinearization, plan: BatchPlan
+    ) -> tuple[ContactSet, BatchResult]:
+        """Solve motion and contact with the planned activations, starting at the end that the plan expects."""
+        inputs = replace(inputs, tensions=self._stiffness * plan.activations)
+        return self.solver.solve(inputs, response, velocities=plan.velocities, forces=plan.forces)
+
+    def _replan(
+        self,
+        worlds: torch.Tensor,
+        inputs: BatchInputs,
+        solved: tuple[ContactSet, BatchResult, BatchPlan],
+        last: torch.Tensor,
+        objectives: BatchObjectives,
+        value: torch.Tensor,
+    ) -> tuple[ContactSet, BatchResult, BatchPlan]:
+        """Plan again about the solved end in some worlds, as ``LocomotionStepper.step`` does, and solve again.
+
+        Args:
+            worlds: (k,) the worlds.
+            inputs: steps of all worlds.
+            solved: contacts, result and plan of all worlds.
+            last: (c, M) m, activations of the previous step.
+            objectives: objectives of all worlds.
+            value: (c,) their value at the solved ends.
+
+        Returns:
+            ``solved``, with the better of both results in each of the ``worlds``.
+        """
+        assert self._planner is not None
+        contacts, result, plan = solved
+        old, old_result = contacts.subset(worlds), result.subset(worlds)
+        part = replace(inputs.subset(worlds), contacts=old, normal_bias=self.solver.normal_bias(old, inputs.problem.dt))
+        response = self.solver.linearize(part.problem, old)
+        ends = old_result.velocities, old_result.forces
+        predicted = BatchPrediction(response, plan.activations[worlds], *ends)
+        other = self._planner.plan(part, predicted, last[worlds], objectives.subset(worlds))
+        grown, end = self._solve_plan(part, response, other)
+        cost = objectives.subset(worlds).value(part.problem, grown, end.velocities, end.forces)
+        capacity, every = grown.capacity, torch.arange(len(value), device=self.device)
+        contacts = contacts.with_capacity(capacity).gather(every)
+        result = replace(result, forces=padded(result.forces, capacity - result.forces.shape[1])).gather(every)
+        plan = plan.gather(every)
+        plan.qp_count[worlds] += other.qp_count
+        plan.qp_infeasible[worlds] += other.qp_infeasible
+        plan.failed[worlds] |= other.failed
+        result.is_singular[worlds] |= end.is_singular
+        better = nonzero(end.converged & (cost < value[worlds]))
+        contacts.scatter(worlds[better], grown.gather(better))
+        result.scatter(worlds[better], end.gather(better))
+        plan.activations[worlds[better]] = other.activations[better]
+        return contacts, result, plan
 
     def _start(
         self, state: BatchState, tensions: torch.Tensor, dt: float, drag: float
@@ -318,15 +462,16 @@ class BatchStepper:
         result: BatchResult,
         state: BatchState,
         activations: torch.Tensor,
+        plan: BatchPlan | None = None,
     ) -> BatchStep:
         problem = inputs.problem
         end = problem.end_positions(result.velocities)
         with self._stages("detect"):
             gaps, _ = self.detector.gaps_of_worlds(end)
-        internal = problem.internal_gradient(result.velocities, inputs.tensions)
+        internal = problem.internal_gradient(result.velocities, self._stiffness * activations)
         after = BatchState(
             *(state.worlds, end, result.velocities, state.time + problem.dt),
-            *(contacts.points, contacts.counts, result.forces),
+            *(contacts.points, contacts.counts, result.forces, activations),
         )
         values: Any = after.positions, after.velocities, after.time
         report: Any = {
@@ -337,24 +482,10 @@ class BatchStepper:
             "end_gaps": contacts.end_gaps(problem.dt, result.velocities),
             "min_gap": gaps.amin(dim=1),
             "activations": activations,
-            "qp_count": 0,
-            "qp_infeasible": 0,
+            "qp_count": 0 if plan is None else plan.qp_count,
+            "qp_infeasible": 0 if plan is None else plan.qp_infeasible,
             "newton_iterations": result.iterations,
             "converged": result.converged,
             "added_spin": problem.momentum_correction(internal).norm(dim=1),
         }
         return BatchStep(after, StepReport(**report))
-
-
-def _merged(one: BatchState, other: BatchState) -> BatchState:
-    """Return the worlds of both states, which are disjoint, in ascending order."""
-    capacity = max(one.points.shape[1], other.points.shape[1])
-    one, other = (
-        replace(each, points=padded(each.points, more), forces=padded(each.forces, more))
-        for each, more in ((each, capacity - each.points.shape[1]) for each in (one, other))
-    )
-    values = {
-        field.name: torch.cat([getattr(one, field.name), getattr(other, field.name)]) for field in fields(BatchState)
-    }
-    both = BatchState(**values)
-    return both.gather(torch.argsort(both.worlds))

@@ -21,6 +21,7 @@ from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphCache, GraphStream, PinnedUpload
 from egs_warp.locomotion.linear_step import LinearStep, PredictedStep, torques_of
 from egs_warp.locomotion.objectives import Objective
+from egs_warp.locomotion.step_tensors import WeightedRows, rows_of, synergy_impulses, write_linear_step
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy
@@ -79,40 +80,9 @@ def objective_form(velocities: torch.Tensor, objectives: Sequence[Objective], st
         objectives: objectives of the motion.
         staging: buffer through which their rows and targets are uploaded.
     """
-    size = len(velocities)
-    single, dense_rows = _by_entries(objectives)
-    rows = np.concatenate([np.zeros((0, size)), *(root * dense for root, dense, _ in dense_rows)])
-    targets = np.concatenate([np.zeros(0), *(root * target for root, _, target in dense_rows)])
-    parts = [np.concatenate([np.zeros(0), *each]) for each in zip(*single, strict=True)] or [np.zeros(0)] * 3
-    uploaded = staging.upload(*parts, targets, rows)
-    indices, entries, entry_targets, dense_targets, dense = uploaded.split(
-        [*(len(part) for part in parts), len(targets), rows.size]
-    )
-    residual = entries[:, None] * velocities[indices.long()]
-    residual[:, -1] -= entry_targets
-    form = residual.T @ residual
-    residual = dense.view(-1, size) @ velocities
-    residual[:, -1] -= dense_targets
-    return form.addmm_(residual.T, residual)
-
-
-def _by_entries(objectives: Sequence[Objective]) -> tuple[list[Any], list[Any]]:
-    """Split objectives by their rows.
-
-    Returns:
-        For objectives with one entry in each row: indices, entries and targets, scaled by the square root of the
-        weight. For the others: square root of the weight, dense rows and targets.
-    """
-    single, dense_rows = [], []
-    for objective in objectives:
-        root, rows = np.sqrt(2.0 * objective.weight), objective.rows
-        if isinstance(rows, np.ndarray):
-            dense_rows.append((root, rows, objective.target))
-        elif (np.diff(rows.indptr) == 1).all():
-            single.append((rows.indices, root * rows.data, root * objective.target))
-        else:
-            dense_rows.append((root, rows.toarray(), objective.target))
-    return single, dense_rows
+    parts = rows_of(objectives, len(velocities))
+    indices, *vectors, rows, targets = staging.upload(*parts).split([part.size for part in parts])
+    return WeightedRows(indices.long(), *vectors, rows.view(-1, len(velocities)), targets).form(velocities)
 
 
 class StagingBuffer:
@@ -208,13 +178,10 @@ class DeviceLinearSteps:
         """
         m = self.count
         predicted_velocities, _, free, _ = newton.trial_parts()
-        group_forces = segment_forces[:, :, None] * self._members[:, None, :]
-        impulses = (self._rows.T @ group_forces.flatten(1)).mul_(-dt).view(-1, m)
+        impulses = synergy_impulses(self._rows, self._members, segment_forces, dt)
         solved = self.owner.factors.enqueue_projected_solve(torch.hstack([impulses, free[:, None]]))
-        velocities[:, :m] = solved[:, :-1]
-        columns = velocities[:, m:-1]
-        torch.mul(newton.columns[:, : columns.shape[1]], self.owner.body.weight, out=columns)
-        torch.sub(predicted_velocities, solved[:, -1], out=velocities[:, -1])
+        columns = newton.columns[:, : velocities.shape[1] - m - 1]
+        write_linear_step(solved, columns, predicted_velocities, self.owner.body.weight, velocities)
 
     def lengths(self, positions: torch.Tensor) -> torch.Tensor:
         """Return (M,) m, lengths of the segments at node ``positions`` (3N,)."""

@@ -20,7 +20,7 @@ from egs_warp.contact.device_newton_workspace import FROM_BASE, FROM_START, FROM
 from egs_warp.contact.device_step import vectors
 from egs_warp.contact.newton import ContactLinearization
 from egs_warp.contact.newton_convergence import NewtonProgress
-from egs_warp.fem.batched import as_warp
+from egs_warp.fem.batched import as_warp, as_world
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
 from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.fem.tiled_cholesky import TiledCholesky
@@ -33,12 +33,13 @@ from egs_warp.locomotion.device_linear_step import DeviceLinearSteps, StagingBuf
 from egs_warp.locomotion.device_search import ModeSearchWorkspace, RelaxationWorkspace
 from egs_warp.locomotion.linear_step import PREDICTION_ITERATIONS, PredictedStep, StepInputs, torques_of
 from egs_warp.locomotion.objectives import AnyObjective, Objective
-from egs_warp.locomotion.planner import REGULARIZATION, WORK_WEIGHT, Plan, StepPlanner
+from egs_warp.locomotion.planner import REGULARIZATION, Plan, StepPlanner
 from egs_warp.locomotion.solvers import QpSolver
-from egs_warp.locomotion.step_cost import EFFORT_HORIZON, EFFORT_WEIGHT
+from egs_warp.locomotion.step_cost import EFFORT_HORIZON
+from egs_warp.locomotion.step_tensors import add_activation_cost, add_effort
 from egs_warp.locomotion.strategies import RESTART_COST, needs_restart, restart_from_relaxation
 from egs_warp.muscles.tension import MuscleEnergy
-from egs_warp.precision import real
+from egs_warp.precision import Vec3, real
 
 PARALLEL_RESTART_COST = 0.5 * RESTART_COST
 """If the objective value of a step is at least this, the next step runs its restart concurrently with the first search.
@@ -341,14 +342,14 @@ class PlanWorkspace:
         wp.to_torch(self._second.packed_qp).copy_(wp.to_torch(self._search.packed_qp))
         wp.launch(
             pack_search_kernel,
-            self.m + newton.capacity,
+            (1, self.m + newton.capacity),
             inputs=[
                 body.body.weight,
-                as_warp(activations, real),
-                vectors(self._restart_forces),
+                as_warp(activations[None], real),
+                as_warp(self._restart_forces.view(1, -1, 3), Vec3),
                 self._search.is_accepted,
             ],
-            outputs=[self._second.packed_qp],
+            outputs=[as_world(self._second.packed_qp)],
             device=body.body.assembly.device,
         )
         self._second.enqueue()
@@ -482,27 +483,24 @@ class PlanWorkspace:
         target = body.body.assembly.device
         wp.launch(
             kernels.assemble_qp_kernel,
-            (len(self._form) + width, len(self._form)),
+            (1, len(self._form) + width, len(self._form)),
             inputs=[
                 *(planner.settings.qp_limit, body.body.speed_unit, body.body.weight),
-                *(as_warp(coulomb.counts, wp.int32), as_warp(coulomb.friction, real), as_warp(self._form, real)),
-                *(
-                    as_warp(self._contact_velocities, real),
-                    as_warp(coulomb.normal_bias, real),
-                    as_warp(self._bounds, real),
-                ),
-                vectors(newton.target_forces),
+                *(as_warp(coulomb.counts, wp.int32), as_warp(coulomb.friction, real)),
+                *(as_warp(each[None], real) for each in (self._form, self._contact_velocities)),
+                *(as_warp(each[None], real) for each in (coulomb.normal_bias.view(-1), self._bounds)),
+                as_warp(newton.target_forces.view(1, -1, 3), Vec3),
             ],
-            outputs=[self._search.packed_qp],
+            outputs=[as_world(self._search.packed_qp)],
             device=target,
         )
         self._search.is_accepted.zero_()
         body.stream.fork_join([self._search.enqueue, *([self._enqueue_restart] if is_parallel else [])])
         wp.launch(
             kernels.scatter_solution_kernel,
-            len(self._x),
-            inputs=[as_warp(coulomb.counts, wp.int32), self._search.packed_result, self.m],
-            outputs=[as_warp(self._x, real)],
+            (1, len(self._x)),
+            inputs=[as_warp(coulomb.counts, wp.int32), as_world(self._search.packed_result), self.m],
+            outputs=[as_warp(self._x[None], real)],
             device=target,
         )
         wp.launch(
@@ -539,16 +537,12 @@ class PlanWorkspace:
     def _enqueue_cost(self, dt: float, time: float) -> None:
         """Queue the addition of effort and activation costs to ``_form``, see ``effort_cost`` and ``StepPlanner``."""
         body, newton, owner, form = self.body, self.newton, self.owner, self._form
-        unit = EFFORT_WEIGHT / (body.body.weight * body.body.height)
         reference = dt * newton.trial_parts()[0]
         masses = body.masses.repeat_interleave(3)
         quadratic, linear_terms = owner.factors.enqueue_quadratic_form(
             self._entries, self._gradient, masses, self._velocities, dt, time - dt, reference
         )
-        form.add_(quadratic, alpha=unit)
-        form[:, -1].add_(linear_terms, alpha=unit)
-        form[-1, -1].add_(unit * (linear_terms[-1] + 2.0 * self._energy[0]) + self._constant[0])
+        add_effort(form, quadratic, linear_terms, self._energy[0], body.body)
         shortenings = owner.linear.lengths(body.positions) - owner.linear.lengths(newton.end_positions)
-        squared_work = owner.members.T @ (owner.work_factors * shortenings).square()
-        form.diagonal()[: self.m].add_(self._diagonal + (2.0 * WORK_WEIGHT) * squared_work)
-        form[: self.m, -1].add_(self._linear_terms)
+        squared_work = (owner.work_factors * shortenings).square() @ owner.members
+        add_activation_cost(form, self._diagonal, self._linear_terms, self._constant[0], squared_work)

@@ -12,18 +12,22 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from egs_warp.fem.batched import StructPerWorld, allocate_struct
 from egs_warp.kernels.locomotion import mode_search as kernels
-from egs_warp.kernels.locomotion.active_set import NUMERICAL_FAILURE, OPTIMUM_FOUND
+from egs_warp.kernels.locomotion.active_set import NUMERICAL_FAILURE, OPTIMUM_FOUND, ActiveSet, UnitConstraints
 from egs_warp.kernels.locomotion.mode_region import CONE_FACES
 from egs_warp.kernels.locomotion.relaxed_contact import Relaxed, relaxed_qp_kernel
 from egs_warp.kernels.locomotion.splitting import Splitting
 from egs_warp.launching import PinnedMirror, device_of, round_up, thread_local_cache
-from egs_warp.locomotion.active_set import active_set_arrays
+from egs_warp.locomotion.active_set import active_set_shapes
 from egs_warp.locomotion.contact_modes import ContactModes, CoulombProgram, ModeSearchResult
 from egs_warp.precision import real
 
-_CAPACITY_MULTIPLE = 8
+CAPACITY_MULTIPLE = 8
 """Contact capacities are multiples of this."""
+WORLD_BLOCK = 128
+"""Number of threads of the block of each world on a GPU; smaller than for one world, so that several blocks run on a
+multiprocessor."""
 
 
 def search_modes_device(
@@ -41,7 +45,7 @@ def search_modes_device(
     Returns:
         The result, or None on numerical failure.
     """
-    capacity = round_up(program.contact_count, _CAPACITY_MULTIPLE)
+    capacity = round_up(program.contact_count, CAPACITY_MULTIPLE)
     return _thread_workspace(program.activation_count, capacity, device.alias).search(program, start, modes, qp_limit)
 
 
@@ -58,50 +62,14 @@ class ModeSearchWorkspace:
     ) -> None:
         self._device, size = wp.get_device(alias), m + 3 * n
         zeros = partial(wp.zeros, device=self._device)
-        self.packed_qp = zeros(
-            kernels.HEADER_SIZE + size * size + size + 3 * n * (size + 1) + 3 * m + 3 * n, dtype=real
-        )
+        self.packed_qp = zeros(packed_qp_size(m, n), dtype=real)
         self.packed_result, self.is_accepted = zeros(kernels.HEADER_SIZE + size, dtype=real), zeros(1, dtype=int)
-        constraint_capacity, force_count, base_count = 9 * n, 3 * n, 5 * n
-        row_capacity = m + constraint_capacity
-        workspace = kernels.Workspace()
-        for name, shape in {
-            **dict.fromkeys(("held_index", "first"), n),
-            **dict.fromkeys(("closed_forces", "held_forces", "speeds"), force_count),
-            **{
-                "base_rows": (constraint_capacity, 3),
-                "contact": constraint_capacity,
-                "transition": constraint_capacity,
-                "next": constraint_capacity,
-                "kinds": (4, n),
-            },
-        }.items():
-            setattr(workspace, name, zeros(shape, dtype=int))
-        for name, shape in {
-            "coefficients": (constraint_capacity, 3),
-            "equations": (force_count, force_count + m + 1),
-            "force_map": (base_count, m + 1),
-            "cost_rows": (size, force_count),
-            "cost_products": (size, m + 1),
-            **dict.fromkeys(("cost", "root"), (m, m)),
-            **dict.fromkeys(("slope", "minimum", "optimum", "start"), m),
-            **dict.fromkeys(("at_minimum", "at_start", "at_optimum"), base_count),
-            **{
-                "lengths": row_capacity,
-                "bounds": (2, row_capacity),
-                "multipliers": constraint_capacity,
-                "slips": (4, n, 2),
-            },
-            **dict.fromkeys(("values", "trial"), size),
-        }.items():
-            setattr(workspace, name, zeros(shape, dtype=real))
+        cancelled = first_search.is_accepted if first_search else zeros(1, dtype=int)
         # The launch holds the addresses of these structs' arrays.
-        self._structs = (
-            workspace,
-            *_active_set(
-                row_capacity, m + base_count, m, first_search.is_accepted if first_search else zeros(1, dtype=int)
-            ),
-        )
+        self._structs = [
+            allocate_struct(struct, shapes, self._device, **_cancelled_by(struct, cancelled))
+            for struct, shapes in mode_search_shapes(m, n).items()
+        ]
         inputs = [self.packed_qp, restart_cost, *self._structs]
         self._launch: Any = _launch(kernels.mode_search_kernel, inputs, [self.packed_result, self.is_accepted])
 
@@ -121,17 +89,7 @@ class ModeSearchWorkspace:
 
     def parse_input(self) -> tuple[CoulombProgram, np.ndarray, ContactModes]:
         """Return the contents of ``packed_qp``: the QP, the activations (m,) at the start, and the modes there."""
-        packed = self.packed_qp.numpy()
-        m, n = int(packed[0]), int(packed[1])
-        size = m + 3 * n
-        shapes = (size, size), (size,), (3 * n, size), (3 * n,), (m,), (m,), (m,), (n,), (n, 2)
-        ends = np.cumsum([math.prod(shape) for shape in shapes])
-        parts = np.split(packed[kernels.HEADER_SIZE : kernels.HEADER_SIZE + ends[-1]], ends[:-1])
-        P, q, rows, offset, lower, upper, *start = (
-            each.reshape(shape) for each, shape in zip(parts, shapes, strict=True)
-        )
-        program = CoulombProgram(P, q, float(packed[3]), rows, offset, float(packed[2]), lower, upper)
-        return program, start[0], ContactModes(start[1].astype(int), start[2])
+        return parse_packed_qp(self.packed_qp.numpy())
 
     def search(
         self, program: CoulombProgram, start: np.ndarray, modes: ContactModes, qp_limit: int
@@ -153,12 +111,7 @@ class ModeSearchWorkspace:
 
     def parse_result(self, size: int) -> ModeSearchResult | None:
         """Download the result, whose point has ``size`` entries; return None on numerical failure."""
-        packed_result = self._host_result.get()
-        status, count, infeasible, objective, has_point = packed_result[:5].tolist()
-        if status == NUMERICAL_FAILURE:
-            return None
-        x = packed_result[kernels.HEADER_SIZE : kernels.HEADER_SIZE + size] if has_point else None
-        return ModeSearchResult(x, objective, int(count), int(infeasible))
+        return parse_packed_result(self._host_result.get(), size)
 
 
 class RelaxationWorkspace:
@@ -169,18 +122,15 @@ class RelaxationWorkspace:
     """
 
     def __init__(self, m: int, n: int, search: ModeSearchWorkspace) -> None:
-        device, size, row_capacity = device_of(search.packed_qp), m + 3 * n, m + (2 + CONE_FACES) * n
+        device = device_of(search.packed_qp)
         self.packed_result = wp.zeros(kernels.HEADER_SIZE + m, dtype=real, device=device)
-        relaxed = Relaxed()
-        for name, shape in {
-            **{"cost": (size, size), "root": (size, size), "leaving": (n, size), "speeds": n},
-            **dict.fromkeys(("minimum", "optimum", "slope", "values"), size),
-            **{"lengths": row_capacity, "bounds": (2, row_capacity)},
-        }.items():
-            setattr(relaxed, name, wp.zeros(shape, dtype=real, device=device))
         # The launch holds the addresses of these structs' arrays.
-        self._structs = search.packed_qp, relaxed, *_active_set(row_capacity, n + size, size, search.is_accepted)
-        self._launch: Any = _launch(relaxed_qp_kernel, list(self._structs), [self.packed_result])
+        self._structs = [
+            allocate_struct(struct, shapes, device, **_cancelled_by(struct, search.is_accepted))
+            for struct, shapes in relaxation_shapes(m, n).items()
+        ]
+        inputs = [search.packed_qp, *self._structs]
+        self._launch: Any = _launch(relaxed_qp_kernel, inputs, [self.packed_result])
 
     @cached_property
     def _host_result(self) -> PinnedMirror:
@@ -204,13 +154,82 @@ class RelaxationWorkspace:
         )
 
 
-def _active_set(rows: int, base_rows: int, unknowns: int, cancelled: wp.array) -> tuple[Any, Any, Any]:
-    """Allocate ``UnitConstraints``, ``ActiveSet`` and ``Splitting``, see ``active_set_arrays``."""
-    zeros, splitting = partial(wp.zeros, dtype=real, device=device_of(cancelled)), Splitting()
-    splitting.initial_values, splitting.all_multipliers = zeros(rows), zeros(rows)
-    for name in ("rows", "projected", "multipliers", "sums", "right", "between", "step"):
-        setattr(splitting, name, zeros(unknowns))
-    return *active_set_arrays(rows, base_rows, unknowns, cancelled), splitting
+def packed_qp_size(m: int, n: int) -> int:
+    """Return the length of the packed input of ``mode_search_kernel`` for ``m`` activations and ``n`` contacts."""
+    size = m + 3 * n
+    return kernels.HEADER_SIZE + size * size + size + 3 * n * (size + 1) + 3 * m + 3 * n
+
+
+def parse_packed_qp(packed: np.ndarray) -> tuple[CoulombProgram, np.ndarray, ContactModes]:
+    """Return the contents of a packed input: the QP, the activations (m,) at the start, and the modes there."""
+    m, n = int(packed[0]), int(packed[1])
+    size = m + 3 * n
+    shapes = (size, size), (size,), (3 * n, size), (3 * n,), (m,), (m,), (m,), (n,), (n, 2)
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    parts = np.split(packed[kernels.HEADER_SIZE : kernels.HEADER_SIZE + ends[-1]], ends[:-1])
+    P, q, rows, offset, lower, upper, *start = (each.reshape(shape) for each, shape in zip(parts, shapes, strict=True))
+    program = CoulombProgram(P, q, float(packed[3]), rows, offset, float(packed[2]), lower, upper)
+    return program, start[0], ContactModes(start[1].astype(int), start[2])
+
+
+def parse_packed_result(packed: np.ndarray, size: int) -> ModeSearchResult | None:
+    """Return a packed result, whose point has ``size`` entries; None on numerical failure."""
+    status, count, infeasible, objective, has_point = packed[:5].tolist()
+    if status == NUMERICAL_FAILURE:
+        return None
+    x = packed[kernels.HEADER_SIZE : kernels.HEADER_SIZE + size] if has_point else None
+    return ModeSearchResult(x, objective, int(count), int(infeasible))
+
+
+def mode_search_shapes(m: int, n: int) -> dict[Any, dict[str, tuple[int, ...]]]:
+    """Return the structs of ``mode_search_kernel`` in its order, each with the shapes of its arrays, for at most ``m``
+    activations and ``n`` contacts."""
+    size, constraint_capacity, force_count, base_count = m + 3 * n, 9 * n, 3 * n, 5 * n
+    row_capacity = m + constraint_capacity
+    shapes = {
+        **dict.fromkeys(("held_index", "first"), (n,)),
+        **dict.fromkeys(("closed_forces", "held_forces", "speeds"), (force_count,)),
+        **dict.fromkeys(("base_rows", "coefficients"), (constraint_capacity, 3)),
+        **dict.fromkeys(("contact", "transition", "next", "multipliers"), (constraint_capacity,)),
+        **{"kinds": (4, n), "slips": (4, n, 2)},
+        "equations": (force_count, force_count + m + 1),
+        "force_map": (base_count, m + 1),
+        "cost_rows": (size, force_count),
+        "cost_products": (size, m + 1),
+        **dict.fromkeys(("cost", "root"), (m, m)),
+        **dict.fromkeys(("slope", "minimum", "optimum", "start"), (m,)),
+        **dict.fromkeys(("at_minimum", "at_start", "at_optimum"), (base_count,)),
+        **{"lengths": (row_capacity,), "bounds": (2, row_capacity)},
+        **dict.fromkeys(("values", "trial"), (size,)),
+    }
+    return {kernels.Workspace: shapes, **_active_set_shapes(row_capacity, m + base_count, m)}
+
+
+def relaxation_shapes(m: int, n: int) -> dict[Any, dict[str, tuple[int, ...]]]:
+    """Return the structs of ``relaxed_qp_kernel``, see ``mode_search_shapes``."""
+    size, row_capacity = m + 3 * n, m + (2 + CONE_FACES) * n
+    shapes = {
+        **{"cost": (size, size), "root": (size, size), "leaving": (n, size), "speeds": (n,)},
+        **dict.fromkeys(("minimum", "optimum", "slope", "values"), (size,)),
+        **{"lengths": (row_capacity,), "bounds": (2, row_capacity)},
+    }
+    return {Relaxed: shapes, **_active_set_shapes(row_capacity, n + size, size)}
+
+
+def _active_set_shapes(rows: int, base_rows: int, unknowns: int) -> dict[Any, dict[str, tuple[int, ...]]]:
+    """Return ``UnitConstraints``, ``ActiveSet`` and ``Splitting`` with their shapes, see ``active_set_shapes``."""
+    row_shapes, state_shapes = active_set_shapes(rows, base_rows, unknowns)
+    names = "rows", "projected", "multipliers", "sums", "right", "between", "step"
+    shapes: dict[str, tuple[int, ...]] = {
+        **dict.fromkeys(names, (unknowns,)),
+        **dict.fromkeys(("initial_values", "all_multipliers"), (rows,)),
+    }
+    return {UnitConstraints: row_shapes, ActiveSet: state_shapes, Splitting: shapes}
+
+
+def _cancelled_by(struct: Any, cancelled: wp.array) -> dict[str, wp.array]:
+    """Return ``cancelled`` as the field of that name if ``struct`` has it."""
+    return {"cancelled": cancelled} if struct is UnitConstraints else {}
 
 
 def _launch(kernel: Any, inputs: list[Any], outputs: list[wp.array]) -> Any:
@@ -225,6 +244,42 @@ def _launch(kernel: Any, inputs: list[Any], outputs: list[wp.array]) -> Any:
         block_dim=kernels.BLOCK,
         record_cmd=True,
     )
+
+
+class SearchPool:
+    """Scratch memory of ``mode_search_of_worlds_kernel``, or of ``relaxed_qp_of_worlds_kernel``, for some worlds at
+    once. More worlds are processed in several launches.
+    """
+
+    def __init__(self, kernel: Any, shapes: dict[Any, dict[str, tuple[int, ...]]], worlds: int, alias: str) -> None:
+        """Allocate the memory.
+
+        Args:
+            kernel: the kernel.
+            shapes: its structs with the shapes of their arrays, as of ``mode_search_shapes``.
+            worlds: number of worlds that are processed at once.
+            alias: name of the device.
+        """
+        self._device, self._kernel, self._worlds = wp.get_device(alias), kernel, worlds
+        self._never = wp.zeros(1, dtype=int, device=self._device)
+        self._structs = [
+            StructPerWorld(struct, each, worlds, self._device, **_cancelled_by(struct, self._never))
+            for struct, each in shapes.items()
+        ]
+
+    def run(self, packed: wp.array, *outputs: wp.array) -> None:
+        """Launch the kernel for the worlds of ``packed`` (B, ...); its ``outputs`` (B, ...) are written."""
+        lanes = 1 if self._device.is_cpu else WORLD_BLOCK
+        for first in range(0, packed.shape[0], self._worlds):
+            part = slice(first, min(first + self._worlds, packed.shape[0]))
+            wp.launch(
+                self._kernel,
+                dim=(part.stop - part.start, lanes),
+                inputs=[packed[part], *(each.structs for each in self._structs)],
+                outputs=[each[part] for each in outputs],
+                device=self._device,
+                block_dim=lanes,
+            )
 
 
 _thread_workspace = thread_local_cache(16)(ModeSearchWorkspace)

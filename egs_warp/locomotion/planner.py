@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -157,11 +158,11 @@ class StepPlanner:
             coulomb_program, PredictedContact(start, predicted.forces / weight, slip), linear, contact_velocities
         )
 
-    def activation_bounds(self, previous: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower and upper bounds (m,) of the activations after ``dt`` s from ``previous`` (m,): [-1, 1] and the
-        maximum rate of change."""
+    def activation_bounds(self, previous: Any, dt: float) -> tuple[Any, Any]:
+        """Return lower and upper bounds (..., m) of the activations after ``dt`` s from ``previous`` (..., m), an array
+        or a tensor: [-1, 1] and the maximum rate of change."""
         max_change = _MAX_ACTIVATION_RATE * dt / self.body.time_unit
-        return np.maximum(previous - max_change, -1.0), np.minimum(previous + max_change, 1.0)
+        return (previous - max_change).clip(-1.0, None), (previous + max_change).clip(None, 1.0)
 
     def _activation_cost(
         self, problem: StepProblem, predicted_velocities: np.ndarray, previous: np.ndarray, count: int

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, TypedDict, TypeVar, Unpack
 
 import numpy as np
 
@@ -22,6 +21,8 @@ from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.short_repr import short_repr
+
+T = TypeVar("T")
 
 FRAME_RATE = 60
 """Frame rate of a video, 1/s."""
@@ -88,7 +89,7 @@ class BodyRun:
         resume: Path | None = None,
         kicks: Kicks = lambda time, dt: None,
     ) -> None:
-        """Begin at ``start``; the arguments are described at ``roll_out``."""
+        """Begin at ``start``; the arguments are described at ``rollout_steps``."""
         self.stepper, self._motion, self._kicks = stepper, motion, kicks
         self._up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
         self.state, self.memory = start, stepper.initial_memory()
@@ -154,7 +155,77 @@ class BodyRun:
         return RolloutResult(self._recorder.trajectory(), tuple(self.reports), np.array(self._shown), stopped)
 
 
+@dataclass(frozen=True)
+class StepRequest:
+    """A step that a run needs."""
+
+    state: BodyState
+    """State at the start, after external pushes."""
+    memory: WarmStart
+    objectives: Sequence[AnyObjective]
+    """Objectives of the motion."""
+    activations: np.ndarray | None
+    """(M,) m, prescribed activations; None plans them from the objectives."""
+    dt: float
+    """Step size, s."""
+
+    def advance(self, stepper: LocomotionStepper) -> list[StepReport]:
+        """Make the step with ``stepper``. Return its reports; an empty list if neither the step nor a part of it can be
+        solved."""
+        state, memory, activations = self.state, self.memory, self.activations
+        try:
+            if activations is None:
+                _, _, done = stepper.advance(state, memory, self.objectives, self.dt)
+            else:
+                _, _, done = stepper.advance_with_activations(state, memory, activations, self.dt)
+        except (UnsolvableStepError, np.linalg.LinAlgError):
+            return []
+        return done if any(report.converged for report in done) else []
+
+
+RunSteps: TypeAlias = Generator[StepRequest, list[StepReport], T]
+"""A run that yields each step that it needs, receives its reports, and returns its result."""
+
+
+def run_with(stepper: LocomotionStepper, steps: RunSteps[T]) -> T:
+    """Make the ``steps`` of a run with ``stepper`` and return the result of the run."""
+    try:
+        request = next(steps)
+        while True:
+            request = steps.send(request.advance(stepper))
+    except StopIteration as end:
+        return end.value
+
+
+class RolloutOptions(TypedDict, total=False):
+    """Options of ``rollout_steps``."""
+
+    step: float | None
+    place: BodyFrame | None
+    front: np.ndarray | None
+    parts: Callable[[], Path] | None
+    resume: Path | None
+    finished: Callable[[], bool]
+    aborted: Callable[[], bool]
+    kicks: Kicks
+    activations: np.ndarray | None
+    progress: Callable[[int], object]
+
+
 def roll_out(
+    stepper: LocomotionStepper,
+    geometry: ContactGeometry,
+    start: BodyState,
+    motion: Motion,
+    *,
+    frames: int,
+    **options: Unpack[RolloutOptions],
+) -> RolloutResult:
+    """Run ``frames`` frames of ``motion`` from ``start``; arguments as for ``rollout_steps``."""
+    return run_with(stepper, rollout_steps(stepper, geometry, start, motion, frames=frames, **options))
+
+
+def rollout_steps(
     stepper: LocomotionStepper,
     geometry: ContactGeometry,
     start: BodyState,
@@ -171,9 +242,9 @@ def roll_out(
     kicks: Kicks = lambda time, dt: None,
     activations: np.ndarray | None = None,
     progress: Callable[[int], object] = lambda frame: None,
-) -> RolloutResult:
+) -> RunSteps[RolloutResult]:
     """Run ``frames`` frames of ``motion`` from ``start``. The run ends earlier if the motion has ``finished`` for
-    ``REST_FRAMES`` frames, or if a step cannot be solved.
+    ``REST_FRAMES`` frames, or if a step cannot be solved. The caller makes the steps (``run_with``).
 
     Args:
         stepper: stepper of the body.
@@ -207,11 +278,8 @@ def roll_out(
                 break
             step_activations = None if activations is None else activations[frame * per_frame + part]
             state, done = run.begin_step(objectives, dt, step_activations)
-            if step_activations is None:
-                advance = partial(stepper.advance, state, run.memory, objectives, dt)
-            else:
-                advance = partial(stepper.advance_with_activations, state, run.memory, step_activations, dt)
-            done = done or _try_advance(advance)
+            if not done:
+                done = yield StepRequest(state, run.memory, objectives, step_activations, dt)
             stopped = not done
             if stopped:
                 break
@@ -237,12 +305,3 @@ def _without_pushes(report: StepReport, up: np.ndarray) -> StepReport:
         forces=report.forces[kept],
         end_gaps=report.end_gaps[kept],
     )
-
-
-def _try_advance(advance: Callable[[], tuple[BodyState, WarmStart, list[StepReport]]]) -> list[StepReport]:
-    """Return the reports of a step; an empty list if neither the step nor a part of it can be solved."""
-    try:
-        _, _, done = advance()
-    except (UnsolvableStepError, np.linalg.LinAlgError):
-        return []
-    return done if any(report.converged for report in done) else []

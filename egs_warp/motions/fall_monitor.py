@@ -1,4 +1,5 @@
-"""Detection of falls from tilt and contacts; a fall ends the motion, or starts the attempt to get up."""
+"""Detection of falls from tilt, contacts and capture point; a fall ends the motion, or starts the attempt to get
+up."""
 
 from __future__ import annotations
 
@@ -14,8 +15,10 @@ from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.follow import Follow
 from egs_warp.motions.get_up import GetUp
 from egs_warp.motions.keyframes import Quantity
+from egs_warp.motions.pendulum import capture_point, momentum_as_velocity
 from egs_warp.motions.sequence import BodyMotion, MotionSequence, MotionTask, Stance
 from egs_warp.motions.stance import sole_shares
+from egs_warp.motions.support import SupportPolygon
 
 FALLEN_TILT = 60.0
 """Tilt in degrees beyond which a body has fallen. A body with feet of half width w and its centre of mass at height h
@@ -28,6 +31,11 @@ MAX_RECOVERIES = 3
 FALLEN_TIME = 0.5
 """Time in sqrt(H / g) for which a body on the ground must be tilted or lying to be considered fallen. In free fall, it
 descends by H / 8 in this time; brief contacts during a landing are shorter."""
+LOST_TIME, LOST_DISTANCE = 1.0, 0.02
+"""Time in sqrt(H / g), longer than a swing of a walk, and distance in body heights for which and by which the capture
+point must be outside the support for the body to be falling. The distance grows by a factor of four in this time."""
+_MIN_HEIGHT = 0.1
+"""Minimum height of the centre of mass in body heights for which the capture point is computed."""
 
 
 class FallMonitor:
@@ -44,13 +52,14 @@ class FallMonitor:
         """
         body = stance.body
         self.sequence = sequence
-        self._body, self._up = body, stance.ground.axes[2]
+        self._body, self._ground, self._up = body, stance.ground, stance.ground.axes[2]
         arms = stance.standing - body.centre_of_mass(stance.standing)
         self._moments = body.node_mass[:, None] * arms
         self._has_upright = stance.base() is not SupportKind.ROUND_BASE
         self._in_base = sole_shares(body, stance.ground, stance.standing) > 0.0
         self._fallen_time = FALLEN_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
-        self._last_time = self._lying_time = 0.0
+        self._lost_time_limit = LOST_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
+        self._last_time = self._lying_time = self._lost_time = 0.0
         self._gets_up, self._recoveries = gets_up, 0
         self.get_up_time = 0.0
         """Time spent on getting up, s."""
@@ -64,6 +73,15 @@ class FallMonitor:
         """True if the last motion has come to rest or the body has fallen."""
         return self.sequence.is_finished or self.fallen is not None
 
+    @property
+    def fall_note(self) -> str | None:
+        """Description of the fall at the end of the run, including one that has only begun: the capture point has been
+        outside the support for ``LOST_TIME``, so that the body tips over if the run continues. None if the body has not
+        fallen."""
+        if self.fallen is not None or self._lost_time < self._lost_time_limit:
+            return self.fallen
+        return f"tipping over, with its capture point outside its feet, at {self.time:.2f} s"
+
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Return the objectives of the sequence; none if the body has fallen."""
         self.time = state.time
@@ -75,8 +93,11 @@ class FallMonitor:
         elapsed, self._last_time = state.time - self._last_time, state.time
         motion = self.sequence.done[-1].motion
         if isinstance(motion, GetUp):
+            self._lost_time = 0.0
             self._check_recovery(motion, elapsed)
             return
+        is_lost = not tips_body(motion) and self._is_outside_support(state, report)
+        self._lost_time = self._lost_time + elapsed if is_lost else 0.0
         # Do not reset the lying time in the air, because the body may be bouncing on its side.
         if report.forces[:, 0].sum() <= 0.0:
             return
@@ -104,6 +125,23 @@ class FallMonitor:
         elif not getting_up.is_up:
             description = before.fall_note if before is not None else None
             self.fallen = description or f"the body has not got up by {self._last_time:.2f} s"
+
+    def _is_outside_support(self, state: BodyState, report: StepReport) -> bool:
+        """Return True if the capture point of a body on the ground is outside the hull of the contacts."""
+        contacts, body = report.contacts, self._body
+        if contacts.count == 0 or not np.isfinite(state.velocities).all():
+            return False
+        local = self._ground.local(state.positions)
+        com = body.centre_of_mass(local)
+        touching = np.einsum("cw,cwi->ci", contacts.weights, local[contacts.nodes])
+        height = max(float(com[2] - touching[:, 2].mean()), _MIN_HEIGHT * body.height)
+        axes = self._ground.axes
+        velocity = (axes @ body.centre_of_mass(state.velocities))[:2] + momentum_as_velocity(
+            axes @ body.angular_momentum(state.positions, state.velocities), body.mass, height
+        )
+        rate = float(np.sqrt(np.linalg.norm(body.gravity) / height))
+        margin = SupportPolygon.hull(touching[:, :2]).margin(capture_point(com[:2], velocity, rate))
+        return margin < -LOST_DISTANCE * body.height
 
     def _lying_note(self, state: BodyState, report: StepReport) -> str | None:
         """Describe how a body on the ground lies; None if it stands."""

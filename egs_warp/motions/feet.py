@@ -14,7 +14,9 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from egs_warp.contact.contact_set import ContactSet
+from egs_warp.fem.body import SoftBody
 from egs_warp.geometry.tetmesh import TetMesh, edge_graph, mean_edge_length
+from egs_warp.locomotion.objectives import BodyPart, Coordinates, Objective, part_velocity
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs
 
@@ -34,6 +36,8 @@ _SIDE_HEIGHT, _MIDDLE_FRACTION, _BLEND_FRACTION = 0.3, 0.2, 0.6
 """Parameters of a base that is split into two feet: height in body heights up to which a side moves as a foot, width of
 the middle strip that belongs to neither foot, and width over which the sides blend, both as fractions of the half
 width."""
+_HELD_LOAD = 0.1
+"""Load of a foot, as a fraction of the body weight, from which on it is kept from sliding with the full weight."""
 FIRST_FOOT_ANGLE = np.radians(15.0)
 """Maximum angle to the right of straight ahead of a foot that can be the first, radians."""
 
@@ -193,6 +197,41 @@ def foot_loads(feet: Sequence[Foot], report: StepReport | None, weight: float) -
     if report is not None:
         np.add.at(loads, foot_of_contact(feet, report.contacts), report.forces[:, 0] / weight)
     return loads
+
+
+def no_slip_feet(
+    body: SoftBody, feet: Sequence[Foot], contacts: ContactSet, loads: np.ndarray, axes: np.ndarray, weight: float
+) -> list[Objective]:
+    """Return an objective for each loaded foot that keeps it from sliding but lets it turn about its centre of
+    pressure: zero mean velocity of its contacts.
+
+    A foot that is being unloaded has the same weight as any other until it carries less than ``_HELD_LOAD``. The sole
+    is strained, and its strain would otherwise be released by sliding.
+
+    Args:
+        body: the body.
+        feet: its feet.
+        contacts: contacts of the previous time step.
+        loads: (n,) load of each contact by which the mean is weighted, as a fraction of the body weight; 0 excludes a
+            contact.
+        axes: (2, 3) unit vectors along the ground.
+        weight: weight of one foot.
+    """
+    objectives = []
+    owner = foot_of_contact(feet, contacts)
+    for index in range(len(feet)):
+        own = np.where(owner == index, loads, 0.0)
+        load = float(own.sum())
+        if load <= 0.0:
+            continue
+        shares = np.bincount(
+            contacts.nodes.ravel(), (own[:, None] * contacts.weights).ravel(), minlength=len(body.node_mass)
+        )
+        nodes = np.flatnonzero(shares)
+        part = BodyPart(f"foot {index} contact", nodes, shares[nodes])
+        held = weight * min(1.0, load / _HELD_LOAD)
+        objectives.append(part_velocity(body, part, np.zeros(len(axes)), held, Coordinates(axes, False)))
+    return objectives
 
 
 def _are_joined(graph: csr_matrix, limbs: Sequence[np.ndarray], above: np.ndarray) -> list[bool]:

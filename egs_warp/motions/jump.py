@@ -11,9 +11,10 @@ from dataclasses import replace
 import numpy as np
 
 from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.objectives import AnyObjective, BodyPart, Coordinates, part_velocity
+from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.airborne_soles import AirborneSoles
 from egs_warp.motions.facing import HeadingPolicy, KeepHeading
 from egs_warp.motions.jump_plan import (
     LANDING_TIME,
@@ -28,7 +29,7 @@ from egs_warp.motions.jump_plan import (
     sufficient_speed,
 )
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.stance import BalanceController, GroundFrame, Measurement, RestDetector, Weights, sole_shares
+from egs_warp.motions.stance import BalanceController, GroundFrame, Measurement, RestDetector, Weights
 from egs_warp.motions.support import nearest_in_half_planes
 from egs_warp.motions.walk_posture import LeggedPosture, select_posture
 
@@ -70,10 +71,6 @@ TAKE_OFF_RELEASE_TIME = 0.6
 URGENT_CAPTURE_MARGIN = 0.5
 """Distance of the capture point from the middle of the feet, as a fraction of the distance to their edge. Beyond it, a
 landing body is balanced with increased weights."""
-SWING_WEIGHT, BASE_SWING_WEIGHT = 5.0, 1.0
-"""Weights of the velocities of the soles in the air, for feet on legs and for a single base. Without these objectives,
-the soles land 0.03 body heights short, and a body with little support in front falls over them. A base is stiff: with a
-weight of 5, a monkey's jump takes 50 % more work and does not land better."""
 AIRBORNE_POSE_WEIGHT, BASE_AIRBORNE_POSE_WEIGHT = 2.0, 0.3
 """Weights of the pose in the air. The first is for bodies on legs, and for bodies that turn in the air, whose rotation
 depends on their width. The second is for a single base without a turn: with a weight of 2, the muscles of a pawn do
@@ -121,12 +118,8 @@ class Jump:
         )
         feet, posture = select_posture(stance)
         on_legs = posture is LeggedPosture
-        self._swing = SWING_WEIGHT if on_legs else BASE_SWING_WEIGHT
         self._airborne = AIRBORNE_POSE_WEIGHT if on_legs or self.facing.target_heading else BASE_AIRBORNE_POSE_WEIGHT
-        base = np.flatnonzero(sole_shares(body, ground, stance.standing))
-        self._soles = [
-            BodyPart.of(body, "sole", sole) for sole in ([foot.sole for foot in feet] if on_legs else [base])
-        ]
+        self._soles = AirborneSoles.of(stance, feet, on_legs=on_legs)
         self._time_unit = float(np.sqrt(body.height / self.gravity))
         # Feet on legs do not move after touch-down while the fall is stopped.
         self._landing_time = LANDING_TIME * self._time_unit if on_legs else 0.0
@@ -342,19 +335,8 @@ class Jump:
         # Increase the weights gradually, so that the strain of the thrust is released first.
         share = self._ramp_or_full(state.time + dt, TAKE_OFF_RELEASE_TIME)
         objectives = self._body_objectives(state, measurement, velocity, pose, spin, dt, left=left, share=share)
-        return [*objectives, *self._swing_objectives(state, pose, left, share)]
-
-    def _swing_objectives(self, state: BodyState, pose: np.ndarray, left: float, share: float) -> list[AnyObjective]:
-        """Return objectives that move the soles to their positions in the ``pose`` (3, 3) of the landing within
-        ``left`` seconds, with the fraction ``share`` of their weight."""
         rate = min(APPROACH_RATE / left, 6.0 / self._time_unit)
-        com, about = self.body.centre_of_mass(state.positions), Coordinates(np.eye(3), True)
-
-        def swung(sole: BodyPart) -> AnyObjective:
-            offset = pose @ sole.centre(self.controller.arms) - (sole.centre(state.positions) - com)
-            return part_velocity(self.body, sole, rate * offset, share * self._swing, about)
-
-        return [swung(sole) for sole in self._soles]
+        return [*objectives, *self._soles.objectives(self.controller, state, pose, rate, share)]
 
     def _land(self, state: BodyState, measurement: Measurement, dt: float) -> list[AnyObjective]:
         rate = self.plan.landing_rate

@@ -49,3 +49,22 @@ def drift(off: np.ndarray, push: np.ndarray, growth: float) -> np.ndarray:
         growth: exp(w t) for the time t of the prediction.
     """
     return off * growth - push * (growth - 1.0)
+
+
+def momentum_as_velocity(momentum: np.ndarray, mass: float, height: float) -> np.ndarray:
+    """Return the velocity (2,) in m/s along the ground by which an angular ``momentum`` (3,) kg m^2/s about the centre
+    of mass, ground axes, contributes to the angular momentum about a point on the ground.
+
+    Args:
+        momentum: angular momentum.
+        mass: mass of the body, kg.
+        height: height of the centre of mass above the point, m.
+    """
+    turning = momentum / (mass * height)
+    return np.array([turning[1], -turning[0]])
+
+
+def capture_point(com: np.ndarray, velocity: np.ndarray, rate: float) -> np.ndarray:
+    """Return the point (2,) over which a pendulum with its centre of mass at ``com`` (2,) m, moving at ``velocity``
+    (2,) m/s, comes to rest; ``rate`` is w, 1/s."""
+    return com + velocity / rate

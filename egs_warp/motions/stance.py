@@ -21,6 +21,7 @@ from egs_warp.locomotion.objectives import (
     deformation_velocities,
 )
 from egs_warp.locomotion.stepper import StepReport
+from egs_warp.motions.pendulum import capture_point, momentum_as_velocity
 from egs_warp.motions.support import SupportPolygon
 
 SHEAR_BASIS = np.einsum("ki,j->kij", np.eye(3)[:2], np.eye(3)[2])
@@ -283,9 +284,8 @@ class BalanceController:
 
     def _capture(self, measurement: Measurement) -> np.ndarray:
         """Return the capture point (2,), over which the feet could bring the body to rest."""
-        return measurement.com[:2] + (measurement.velocity[:2] + measurement.angular_velocity_term) / np.sqrt(
-            self._pendulum_rate2(measurement)
-        )
+        velocity = measurement.velocity[:2] + measurement.angular_velocity_term
+        return capture_point(measurement.com[:2], velocity, float(np.sqrt(self._pendulum_rate2(measurement))))
 
     def _com_height(self, com: np.ndarray) -> float:
         """Return the height in metres of the centre of mass ``com`` (3,), ground coordinates, above the feet; at least
@@ -294,8 +294,7 @@ class BalanceController:
 
     def _angular_velocity_term(self, momentum: np.ndarray, height: float) -> np.ndarray:
         """Return ``Measurement.angular_velocity_term`` (2,) of an angular ``momentum`` (3,), world axes."""
-        turning = self.ground.axes @ momentum / (self.body.mass * height)
-        return np.array([turning[1], -turning[0]])
+        return momentum_as_velocity(self.ground.axes @ momentum, self.body.mass, height)
 
     def _base(self, local: np.ndarray) -> np.ndarray:
         return (self._sole_share @ local)[:2]

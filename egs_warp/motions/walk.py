@@ -27,7 +27,7 @@ from egs_warp.locomotion.objectives import (
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import foot_loads, foot_of_contact, foot_of_node, order_counterclockwise
+from egs_warp.motions.feet import foot_loads, foot_of_contact, foot_of_node, no_slip_feet, order_counterclockwise
 from egs_warp.motions.footfalls import Footfalls, footfalls
 from egs_warp.motions.footing import FootholdPlanner
 from egs_warp.motions.gait import Gait, smooth
@@ -220,7 +220,7 @@ class Walk:
                 for index in self.swinging
                 if elapsed < self.gait.transfer_end_time
             ),
-            *([self._no_slip_objectives(report, elapsed)] if report is not None else []),
+            *(self._no_slip_objectives(report, elapsed) if report is not None else []),
         ]
 
     def _advance_phase(self, local: np.ndarray, report: StepReport | None, time: float) -> None:
@@ -458,15 +458,17 @@ class Walk:
             self._near_points[index], self.control.unload * self.gait.steering_progress(elapsed / self.gait.swing_time)
         )
 
-    def _no_slip_objectives(self, report: StepReport, elapsed: float) -> Objective:
-        """Return the objective of zero sliding velocity at standing feet, and at lifted feet until they move
-        forward."""
-        contacts = report.contacts
+    def _no_slip_objectives(self, report: StepReport, elapsed: float) -> list[Objective]:
+        """Return the objectives of zero sliding velocity at standing feet, and at lifted feet until they move forward:
+        one for the contacts, and one for each foot."""
+        contacts, control = report.contacts, self.control
         ahead = self.swinging if elapsed > self.gait.transfer_start_time else ()
         stands = ~np.isin(foot_of_contact(self.feet, contacts), ahead)
-        return no_slip_contacts(
-            contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self._posture.stance_weight
-        )
+        loads = np.where(stands, report.forces[:, 0], 0.0) / self.body.weight
+        return [
+            no_slip_contacts(contacts, loads, self._posture.stance_weight),
+            *no_slip_feet(self.body, self.feet, contacts, loads, self.ground.axes[:2], control.slip),
+        ]
 
     def _best_fit_rotation(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Return the (3,) best-fit rotation (Kabsch) from ``before`` (N, 3) to ``after`` (N, 3) as a rotation

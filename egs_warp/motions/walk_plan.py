@@ -44,6 +44,8 @@ class WalkControl:
     pose: float = 0.1
     unload: float = 10.0
     """Weight of the load on the contact points of a lifted foot."""
+    slip: float = 100.0
+    """Weight of the sliding velocity of a standing foot, the mean over its contacts."""
     balance: float = 3.0
     """Shift of the centre of pressure in metres per metre of error of the divergent component of motion."""
     turn_rate: float = 4.0

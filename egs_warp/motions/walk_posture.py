@@ -71,7 +71,8 @@ class WalkPosture(Protocol):
     swing_weight: float
     """Weight of the velocity of a swinging sole."""
     stance_weight: float
-    """Weight of zero slip at standing contact points; each point is scaled by its share of the load."""
+    """Weight of zero slip at standing contact points; each point is scaled by its share of the load. The slip of a
+    whole foot has a weight of its own, ``WalkControl.slip``."""
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
         """Return the target nodes (N, 3), ground coordinates.
@@ -136,7 +137,7 @@ class RockingPosture:
         self.capture_range = 0.0
         self.com_weight = 300.0  # if friction does not suffice for both, balance has priority over turning
         self.swing_weight = 2.0  # half of the body swings; a faster swing pushes the rest back, behind its feet
-        self.stance_weight = 5.0  # a patch that rotates on the ground slides at its edges
+        self.stance_weight = 1.0  # a patch that rotates on the ground slides at its edges
 
     def _inertia(self, node_mass: np.ndarray) -> float:
         """Return the angular momentum about the up axis through the centre of mass per rotation rate of the base, kg

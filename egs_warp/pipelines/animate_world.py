@@ -11,7 +11,9 @@ import numpy as np
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.motions.stance import REST_SPEED
+from egs_warp.pipelines import render_data
 from egs_warp.pipelines.end_state import State
+from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import (
     GaussianCounts,
     JsonValue,
@@ -88,7 +90,7 @@ def write_world(
     film: bool = True,
     shot: Shot | None = None,
     size: int = 512,
-    view_from: Sequence[float] | None = None,
+    view_from: Sequence[float] | np.ndarray | None = None,
     shadow: bool = True,
     overwrite: bool = False,
     quiet: bool = False,
@@ -131,7 +133,13 @@ def write_world(
             report.write(place / "report.json")
         video = None
         if film:
-            video = draw_world_film(run, folder, shot=shot, size=size, view_from=view_from, shadow=shadow, quiet=quiet)
+            drawn = draw_world_film(run, folder, shot=shot, size=size, view_from=view_from, shadow=shadow, quiet=quiet)
+            video = drawn.file
+            for name, deformer in drawn.deformers.items():
+                result = run.bodies[name]
+                feet = result.place.feet() if isinstance(result, SimulatedRun) else ()
+                render_data_of_body = RenderData.of(deformer.rest, drawn.camera, result.body.muscles, feet)
+                render_data_of_body.save(folder.path / name / render_data.FILE, deformer=deformer)
         whole = WorldReport(reports, results, run.stopped, video, tuple(notes), asked or {})
         write_report(folder.file("report.json"), whole.to_json())
         if not isinstance(out, RunFolder):

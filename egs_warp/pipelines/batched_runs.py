@@ -1,4 +1,8 @@
-"""Batched runs: simulation of many jobs with prescribed activations at once, in one process on one device."""
+"""Batched runs: simulation of many jobs at once, in one process on one device.
+
+Each job is a generator of the steps that it needs (``Job.steps``), and ``BatchStepper`` makes the steps of all jobs of
+a batch in lockstep.
+"""
 
 from __future__ import annotations
 
@@ -6,23 +10,27 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from egs_warp.fem.body import BodyState
 from egs_warp.fem.implicit_step import UNSOLVABLE, UnsolvableStepError
 from egs_warp.launching import available_threads
-from egs_warp.locomotion.rollout import solver_steps
-from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
+from egs_warp.locomotion.rollout import RunSteps, StepRequest, solver_steps
+from egs_warp.locomotion.solvers import QpSolver
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.strategies import Strategy
 from egs_warp.pipelines.captured_body import checked_friction
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.job import Job, RunSummary
-from egs_warp.pipelines.simulated_run import check_frames, checked_activations
+from egs_warp.pipelines.simulated_run import SimulatedRun
 from egs_warp.pipelines.worker_pool import ProgressCallback, TaskResult, run_task
 
 if TYPE_CHECKING:
+    import torch
+
     from egs_warp.locomotion.batch import BatchStepper
+    from egs_warp.locomotion.batch_state import BatchState
 
 MAX_WORLDS = 1024
 """Maximum number of jobs in a batch. Larger batches are hardly faster, and all results stay in memory until the batch
@@ -52,181 +60,218 @@ def choose_batch_size(creature: Creature, jobs: int) -> int:
     return min(MAX_WORLDS, int(_MEMORY_FRACTION * free) // (72 * len(creature.body.mesh.nodes) ** 2))
 
 
-def is_batchable(job: Job) -> bool:
-    """Return True if the job can run in a batch: its activations are prescribed, and nothing pushes the body."""
-    return job.activations is not None and not job.pushes
+def is_batchable(creature: Creature, job: Job) -> bool:
+    """Return True if the job can run in a batch: its activations are prescribed, or they are planned by the strategy
+    and the QP solver of the batch."""
+    settings = creature.stepper.settings
+    return job.activations is not None or (
+        Strategy(settings.strategy) is Strategy.MODES
+        and settings.qp_solver_on(creature.body.assembly.device) is not QpSolver.DAQP
+    )
+
+
+Progress = Callable[[dict[int, tuple[int, int]]], object]
+"""Function that is called with the frames done and expected, by the number of each job that has advanced."""
 
 
 def run_batched(
-    creature: Creature,
-    jobs: Sequence[tuple[int, Job]],
-    *,
-    worlds: int,
-    progress: Callable[[dict[int, tuple[int, int]]], object],
+    creature: Creature, jobs: Sequence[tuple[int, Job]], *, worlds: int, progress: Progress
 ) -> Iterator[TaskResult]:
-    """Run jobs in batches and yield each result when its batch ends. A batch contains only jobs of the same step size.
+    """Run jobs in batches and yield each result when its run ends. A batch contains only jobs of the same step size,
+    and either prescribed or planned activations.
 
     Args:
         creature: The creature of all jobs.
         jobs: Number and job, in any order.
         worlds: Maximum number of jobs in a batch.
-        progress: Called after each frame with the frames done and expected, by the number of each running job.
+        progress: Called after each step.
     """
     batch_jobs: list[_BatchJob] = []
     for number, job in jobs:
-        kind, value = run_task(partial(_make_batch_job, creature, number), job, progress)
+        kind, value = run_task(partial(_make_batch_job, creature, number), job, _no_progress)
         if kind == "done":
             batch_jobs.append(value)
         else:
             yield TaskResult(number, None, value, 1)
-    batch_jobs.sort(key=lambda one: (one.dt, one.number))
-    for _, same_step in groupby(batch_jobs, key=lambda one: one.dt):
-        same_step_jobs = list(same_step)
-        for first in range(0, len(same_step_jobs), worlds):
-            yield from _run_batch(creature, same_step_jobs[first : first + worlds], progress)
+    batch_jobs.sort(key=lambda one: (one.is_planned, one.dt, one.number))
+    for _, alike in groupby(batch_jobs, key=lambda one: (one.is_planned, one.dt)):
+        alike_jobs = list(alike)
+        for first in range(0, len(alike_jobs), worlds):
+            yield from _run_batch(creature, alike_jobs[first : first + worlds], progress)
 
 
 @dataclass(frozen=True)
 class _BatchJob:
-    """A job whose arguments are valid."""
+    """A job whose friction is valid."""
 
     number: int
     job: Job
     friction: float
     dt: float
     """Step size, s."""
-    per_frame: int
-    """Number of steps per frame."""
-    activations: np.ndarray
-    """(steps, M) m, prescribed activations; ``steps`` is a multiple of ``per_frame``."""
+
+    @property
+    def is_planned(self) -> bool:
+        """True if the activations are planned."""
+        return self.job.activations is None
+
+
+def _no_progress(*values: int) -> None:
+    """Report nothing."""
 
 
 def _make_batch_job(creature: Creature, number: int, job: Job, _: ProgressCallback) -> _BatchJob:
-    """Return the job with checked arguments. Raises ``UserError`` if one is invalid."""
-    assert job.activations is not None, "the job is batchable"
-    check_frames(job.frames)
+    """Return the job with checked friction. Raises ``UserError`` if it is invalid."""
     friction = creature.geometry.friction if job.friction is None else checked_friction(job.friction)
-    activations = checked_activations(creature, job.activations, job.step)
-    dt, per_frame = solver_steps(creature.body, job.step)
-    frames = len(activations) // per_frame
-    frames = frames if job.frames is None else min(frames, job.frames - 1)
-    return _BatchJob(number, job, friction, dt, per_frame, activations[: frames * per_frame])
+    return _BatchJob(number, job, friction, solver_steps(creature.body, job.step)[0])
 
 
-def _run_batch(
-    creature: Creature, batch: Sequence[_BatchJob], progress: Callable[[dict[int, tuple[int, int]]], object]
-) -> Iterator[TaskResult]:
-    """Run one batch and yield its results. If the memory does not suffice, run it as two smaller batches."""
+def _run_batch(creature: Creature, batch: Sequence[_BatchJob], progress: Progress) -> Iterator[TaskResult]:
+    """Run one batch and yield its results. If the memory does not suffice, run the rest of it as two smaller
+    batches."""
     import torch
 
-    run, memory_error = None, ""
+    memory_error, finished = "", set[int]()
     try:
-        run = _run(creature, batch, progress)
+        for result in _run(creature, batch, progress):
+            finished.add(result.number)
+            yield result
     except torch.OutOfMemoryError as error:
         memory_error = " ".join(str(error).split())
     # Retry outside the except block, whose traceback keeps the memory of the failed attempt allocated.
-    if run is None and len(batch) == 1:
+    if not memory_error:
+        return
+    remaining = [one for one in batch if one.number not in finished]
+    if len(batch) == 1:
         why = f"out of GPU memory with a single world; set worlds=0 to use worker processes: {memory_error}"
-        yield TaskResult(batch[0].number, None, why, 1)
+        yield TaskResult(remaining[0].number, None, why, 1)
         return
-    if run is None:
-        torch.cuda.empty_cache()
-        half = len(batch) // 2
-        yield from _run_batch(creature, batch[:half], progress)
-        yield from _run_batch(creature, batch[half:], progress)
-        return
-    for one, run_creature, steps, is_unsolvable in zip(batch, run.creatures, run.steps, run.is_unsolvable, strict=True):
-        kind, value = run_task(partial(_outcome, run_creature, steps, is_unsolvable), one.job, progress)
-        yield TaskResult(one.number, *((value, None) if kind == "done" else (None, value)), 1)
+    torch.cuda.empty_cache()
+    half = len(batch) // 2
+    for first in range(0, len(remaining), half):
+        yield from _run_batch(creature, remaining[first : first + half], progress)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Run:
-    """Results of one batch, one entry per job."""
+    """A run of a batch: its world, its steps, and the step that it needs next."""
 
-    creatures: list[Creature]
-    """The creature on the ground of each job."""
-    steps: list[list[list[StepReport]]]
-    """Reports of each step of each job, as ``_run_steps`` returns them."""
-    is_unsolvable: list[bool]
-    """True if the creature cannot stand on the ground of the job."""
+    one: _BatchJob
+    creature: Creature
+    """The creature on the ground of the job."""
+    steps: RunSteps[SimulatedRun]
+    request: StepRequest | None = None
+    last: StepReport | None = None
+    """Report of the last step."""
+
+    def resume(self, done: list[StepReport] | None, job: Job, _: ProgressCallback) -> RunSummary | None:
+        """Continue the run with the reports of its step, or begin it. Return the summary if the run has ended."""
+        self.last = done[-1] if done else None
+        try:
+            self.request = next(self.steps) if done is None else self.steps.send(done)
+        except StopIteration as end:
+            return job.outcome(self.creature, end.value)
+        return None
 
 
-def _run(
-    creature: Creature, batch: Sequence[_BatchJob], progress: Callable[[dict[int, tuple[int, int]]], object]
-) -> _Run:
+def _run(creature: Creature, batch: Sequence[_BatchJob], progress: Progress) -> Iterator[TaskResult]:
+    """Advance all runs of a batch in lockstep and yield the result of each when it ends."""
     from egs_warp.locomotion.batch import BatchStepper
 
     stepper = BatchStepper(
         *(creature.body, creature.muscles, creature.geometry, [one.friction for one in batch]),
         settings=creature.stepper.settings,
+        planner=creature.stepper.planner if batch[0].is_planned else None,
     )
-    starts = [creature.start] * len(batch)
-    is_unsolvable = [False] * len(batch)
+    frames: dict[int, tuple[int, int]] = {}
+    runs = _start_runs(creature, stepper, batch, frames)
+    state = stepper.start([run.creature.start for run in runs])
+    done: dict[int, list[StepReport]] = {}
+    running = list(range(len(runs)))
+    while running:
+        results = [(world, *_resumed(runs[world], done.get(world))) for world in running]
+        if frames:
+            progress(dict(frames))
+            frames.clear()
+        for world, kind, value in results:
+            if kind == "failed" or value is not None:
+                yield TaskResult(runs[world].one.number, *((value, None) if kind == "done" else (None, value)), 1)
+        running = [world for world, kind, value in results if kind == "done" and value is None]
+        done = {world: [] for world in running}
+        state = _advanced(stepper, state, {world: runs[world] for world in running}, done)
+
+
+def _start_runs(
+    creature: Creature, stepper: BatchStepper, batch: Sequence[_BatchJob], frames: dict[int, tuple[int, int]]
+) -> list[_Run]:
+    """Prepare the runs of a batch: let the creature come to rest where its ground has another friction. The runs write
+    their finished and expected frames to ``frames``."""
+    starts, is_unsolvable = [creature.start] * len(batch), [False] * len(batch)
     # Without a friction of the job, the creature is already at rest.
     if any(one.job.friction is not None for one in batch):
         settled, failed = stepper.settle()
         has_friction = [one.job.friction is not None for one in batch]
         starts = [new if changed else start for new, changed, start in zip(settled, has_friction, starts, strict=True)]
         is_unsolvable = [bool(fail) and changed for fail, changed in zip(failed.tolist(), has_friction, strict=True)]
-    creatures = [
-        replace(creature, stepper=creature.stepper.with_friction(one.friction), start=start)
-        for one, start in zip(batch, starts, strict=True)
-    ]
-    return _Run(creatures, _run_steps(stepper, batch, creatures, progress), is_unsolvable)
+    runs = []
+    for one, start, fails in zip(batch, starts, is_unsolvable, strict=True):
+        standing = replace(creature, stepper=creature.stepper.with_friction(one.friction), start=start)
+
+        def update(done: int, expected: int, number: int = one.number) -> None:
+            frames[number] = done, expected
+
+        runs.append(_Run(one, standing, _unsolvable() if fails else one.job.steps(standing, progress=update)))
+    return runs
 
 
-def _outcome(
-    creature: Creature, steps: list[list[StepReport]], is_unsolvable: bool, job: Job, _: ProgressCallback
-) -> RunSummary:
-    if is_unsolvable:
-        raise UnsolvableStepError(UNSOLVABLE)
-    return job.outcome(creature, job.run_on_ground(replace(creature, stepper=_ReplayStepper(creature.stepper, steps))))
+def _unsolvable() -> RunSteps[SimulatedRun]:
+    """Return the steps of a run whose creature cannot stand on its ground: they raise ``UnsolvableStepError``."""
+    raise UnsolvableStepError(UNSOLVABLE)
+    yield
 
 
-class _ReplayStepper(LocomotionStepper):
-    """Stepper that replays the reports of a batched run, so that the motion can measure them."""
-
-    def __init__(self, stepper: LocomotionStepper, steps: list[list[StepReport]]) -> None:
-        vars(self).update(vars(stepper))
-        self._steps = iter(steps)
-
-    def advance_with_activations(
-        self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float
-    ) -> tuple[BodyState, WarmStart, list[StepReport]]:
-        """Return state, warm start and reports of the next stored step."""
-        done = next(self._steps)
-        if not done:
-            raise UnsolvableStepError(UNSOLVABLE)
-        return done[-1].state, WarmStart.from_report(done[-1]), done
+def _resumed(run: _Run, done: list[StepReport] | None) -> tuple[str, Any]:
+    """Continue ``run``; return ``done`` and its summary or None, or ``failed`` and the reason in one line."""
+    return run_task(partial(run.resume, done), run.one.job, _no_progress)
 
 
-def _run_steps(
-    stepper: BatchStepper,
-    batch: Sequence[_BatchJob],
-    creatures: Sequence[Creature],
-    progress: Callable[[dict[int, tuple[int, int]]], object],
-) -> list[list[list[StepReport]]]:
-    """Advance all jobs and return, for each job and step, its reports; a step that cannot be solved has none."""
+def _advanced(
+    stepper: BatchStepper, state: BatchState, runs: dict[int, _Run], done: dict[int, list[StepReport]]
+) -> BatchState:
+    """Make the steps that the ``runs`` (by world) need, add their reports to ``done``, and return the state after them.
+    A run whose step cannot be solved has no reports; its world is removed from the state."""
     import torch
 
-    runs: list[list[list[StepReport]]] = [[] for _ in batch]
-    state = stepper.start([creature.start for creature in creatures])
-    max_steps, per_frame = max(len(one.activations) for one in batch), batch[0].per_frame
-    for number in range(max_steps):
-        has_step = torch.tensor([len(batch[world].activations) > number for world in state.worlds.tolist()])
-        state = state.gather(has_step.nonzero().squeeze(1).to(stepper.device))
-        if len(state.worlds) == 0:
-            break
-        worlds = state.worlds.tolist()
-        for world in worlds:
-            runs[world].append([])
-        activations = np.stack([batch[world].activations[number] for world in worlds])
-        state, done, _ = stepper.advance(state, activations, batch[0].dt)
-        for step in done:
-            for world, report in zip(step.worlds.tolist(), step.reports(), strict=True):
-                runs[world][-1].append(report)
-        if (number + 1) % per_frame == 0:
-            frame = (number + 1) // per_frame
-            progress({batch[w].number: (frame, len(batch[w].activations) // per_frame) for w in worlds})
-    return runs
+    worlds = state.worlds.tolist()
+    rows = [row for row, world in enumerate(worlds) if world in runs]
+    state = state.gather(torch.tensor(rows, dtype=torch.int64, device=stepper.device))
+    requests = [(runs[worlds[row]], _request(runs[worlds[row]])) for row in rows]
+    if not requests:
+        return state
+    state = replace(state, velocities=_pushed_velocities(state, requests))
+    dt = requests[0][1].dt
+    if requests[0][0].one.is_planned:
+        state, steps, _ = stepper.advance(state, [request.objectives for _, request in requests], dt)
+    else:
+        activations = np.stack([np.asarray(request.activations) for _, request in requests])
+        state, steps, _ = stepper.advance_with_activations(state, activations, dt)
+    for step in steps:
+        for world, report in zip(step.worlds.tolist(), step.reports(), strict=True):
+            done[world].append(report)
+    return state
+
+
+def _request(run: _Run) -> StepRequest:
+    assert run.request is not None, "the run has not ended"
+    return run.request
+
+
+def _pushed_velocities(state: BatchState, requests: Sequence[tuple[_Run, StepRequest]]) -> torch.Tensor:
+    """Return the velocities (c, N, 3) m/s of ``state``, replaced where a run has pushed its body."""
+    velocities = state.velocities
+    for row, (run, request) in enumerate(requests):
+        before = run.creature.start if run.last is None else run.last.state
+        if request.state.velocities is not before.velocities:
+            velocities = velocities.clone() if velocities is state.velocities else velocities
+            velocities[row] = velocities.new_tensor(request.state.velocities)
+    return velocities

@@ -14,9 +14,12 @@ from egs_warp.deformation.deformer import Deformer
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import with_degree
+from egs_warp.geometry.main_light import normalised
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.bundle import Bundle, BundleBody, BundleCage, write_bundle
+from egs_warp.io.planes import light_to_json
 from egs_warp.io.run_folder import check_no_file_of_a_run
+from egs_warp.lighting.surface_normals import surface_normals
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.export import chosen_frames
@@ -50,10 +53,15 @@ def bundle_of(run: FinishedRun, *, every: int = 1, degree: int | None = None, li
     """Return the bundle of ``run``: its creature, and its scene as a static body. The arguments are those of
     ``export_bundle``."""
     steps = run.steps[chosen_frames(run, frame=None, every=every)]
-    bodies = [_moving_body(run.deformer(), run.trajectory, steps, degree)]
-    if run.scene is not None:
-        bodies.append(BundleBody("scene", with_degree(run.scene, degree)))
+    light = run.creature.light
+    bodies = [_moving_body(run.deformer(), run.trajectory, steps, degree, has_normals=light is not None)]
+    # The player draws the shadow, also at rest.
+    scene = run.scene_without_shadow()
+    if scene is not None:
+        bodies.append(BundleBody("scene", with_degree(scene, degree)))
     facts = _facts(run.trajectory, run.creature.camera, run.title) | {"licence": licence}
+    if light is not None:
+        facts["light"] = light_to_json(normalised(light))
     return Bundle(tuple(bodies), FRAME_RATE / every, len(steps), facts)
 
 
@@ -95,7 +103,9 @@ def _facts(t: Trajectory, camera: Camera, title: str) -> dict[str, Any]:
     }
 
 
-def _moving_body(deformer: Deformer, t: Trajectory, steps: np.ndarray, degree: int | None) -> BundleBody:
+def _moving_body(
+    deformer: Deformer, t: Trajectory, steps: np.ndarray, degree: int | None, *, has_normals: bool = False
+) -> BundleBody:
     cage = BundleCage(
         rest_nodes=t.rest_positions.astype(np.float32),
         cage_tets=t.tets,
@@ -104,4 +114,5 @@ def _moving_body(deformer: Deformer, t: Trajectory, steps: np.ndarray, degree: i
         nodes=t.positions[steps],
         **deformer.plan_arrays(),
     )
-    return BundleBody("creature", with_degree(deformer.rest, degree), cage)
+    normals = surface_normals(deformer.rest) if has_normals else None
+    return BundleBody("creature", with_degree(deformer.rest, degree), cage, normals)

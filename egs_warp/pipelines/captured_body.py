@@ -7,7 +7,7 @@ contact points, level set), stays in the frame of the cage, so that copies of a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
 
@@ -52,6 +52,31 @@ class CapturedShape:
         return level_set_of_body(self.solid, self.contact_points)
 
 
+@dataclass(frozen=True)
+class Placement:
+    """Rigid motion from the frame of the cage to the frame of the ground."""
+
+    __repr__ = short_repr
+
+    turn: np.ndarray = field(default_factory=lambda: np.eye(3))
+    """(3, 3) rotation."""
+    shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """(3,) m, translation after the rotation."""
+
+    def then(self, turn: np.ndarray, shift: np.ndarray) -> Placement:
+        """Return the motion followed by the rotation ``turn`` (3, 3) and the translation ``shift`` (3,) m."""
+        return Placement(turn @ self.turn, turn @ self.shift + shift)
+
+    def applied_to(self, state: BodyState) -> BodyState:
+        """Return a state in the frame of the cage, moved to the frame of the ground; it keeps its bits if the two are
+        equal."""
+        if np.array_equal(self.turn, np.eye(3)) and not self.shift.any():
+            return state
+        return replace(
+            state, positions=state.positions @ self.turn.T + self.shift, velocities=state.velocities @ self.turn.T
+        )
+
+
 @dataclass(frozen=True, kw_only=True)
 class CapturedBody:
     """A capture with a soft body and a ground, at rest; metres.
@@ -74,6 +99,8 @@ class CapturedBody:
     """Surfaces that the body can touch, the ground first."""
     shape: CapturedShape
     """Captured shape, for contact with other bodies."""
+    placement: Placement = field(default_factory=Placement)
+    """Motion from the frame of the cage to that of ``start`` (``moved``)."""
     notes: tuple[str, ...] = ()
     """Guesses about the capture, for the user."""
 
@@ -98,16 +125,16 @@ class CapturedBody:
         old = self.stepper
         geometry, device = replace(old.geometry, friction=checked_friction(friction)), str(old.body.assembly.device)
         stepper = LocomotionStepper(old.body, old.muscles, geometry, settings=old.settings, device=device)
-        return replace(self, stepper=stepper, start=settle(stepper))
+        return replace(self, stepper=stepper, start=self.placement.applied_to(settle(stepper)))
 
     def _moved(self, turn: np.ndarray, shift: np.ndarray) -> Self:
         """Return the body after the rotation ``turn`` (3, 3) and the translation ``shift`` (3,) m."""
-        start, frame = self.start, self.frame
-        axes = turn @ frame.axes
+        axes, frame = turn @ self.frame.axes, self.frame
         return replace(
             self,
             frame=BodyFrame(axes, frame.origin - shift @ axes / frame.scale, frame.scale),
-            start=replace(start, positions=start.positions @ turn.T + shift, velocities=start.velocities @ turn.T),
+            start=Placement(turn, shift).applied_to(self.start),
+            placement=self.placement.then(turn, shift),
         )
 
     @property

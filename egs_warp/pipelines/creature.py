@@ -274,7 +274,7 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
     muscles = body_muscles(new_body, muscles_file, creature.frame)
     stepper = LocomotionStepper(new_body, muscles, geometry, settings=creature.stepper.settings, device=device)
     stepper, start, _ = _rest_state(stepper, creature.limbs)
-    return replace(creature, stepper=stepper, start=start)
+    return replace(creature, stepper=stepper, start=creature.placement.applied_to(start))
 
 
 def _check_slope(normal: np.ndarray, up: np.ndarray) -> None:

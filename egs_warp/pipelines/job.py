@@ -9,13 +9,14 @@ from typing import TypeAlias
 import numpy as np
 
 from egs_warp.locomotion.ledger import energy_balance
+from egs_warp.locomotion.rollout import RunSteps, run_with
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.style import Style
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run
-from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
+from egs_warp.pipelines.simulated_run import SimulatedRun, simulation_steps
 from egs_warp.short_repr import short_repr
 
 RunSummary: TypeAlias = tuple[Report, np.ndarray, Trajectory]
@@ -52,16 +53,17 @@ class Job:
         """Simulate the job in this process; ``progress`` is called with the frames done and expected."""
         if self.friction is not None:
             creature = creature.with_friction(self.friction)
-        return self.run_on_ground(creature, progress=progress)
+        return run_with(creature.stepper, self.steps(creature, progress=progress))
 
-    def run_on_ground(
+    def steps(
         self, creature: Creature, *, progress: Callable[[int, int], object] = lambda done, expected: None
-    ) -> SimulatedRun:
-        """Simulate the job with a ``creature`` that already stands on ground with the job's friction."""
+    ) -> RunSteps[SimulatedRun]:
+        """Return the steps of the simulation of a ``creature`` that already stands on ground with the job's
+        friction."""
         options = {
             name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("motion", "friction")
         }
-        return simulate(creature, self.motion, **options, progress=progress)
+        return simulation_steps(creature, self.motion, **options, progress=progress)
 
     def outcome(self, creature: Creature, performance: SimulatedRun) -> RunSummary:
         """Return report, frames and trajectory of the run."""

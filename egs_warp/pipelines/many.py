@@ -77,7 +77,8 @@ def simulate_many(
     """Run all ``jobs`` of one ``creature``, several at a time.
 
     In a worker process, a job gives the same bits as ``Job.run`` on a machine of the same kind. In a batch, the node
-    positions differ from those of ``Job.run`` by less than 1e-9 body heights in the first 30 steps.
+    positions differ from those of ``Job.run`` by less than 1e-9 body heights in the first 30 steps, as long as rounding
+    does not decide between contact modes (docs/guide/many.md#gpu).
 
     Each worker receives the creature once and uses one core. A job whose worker is lost is run again, at most twice. A
     job that fails has an error in its result; the others continue.
@@ -87,9 +88,9 @@ def simulate_many(
         jobs: The jobs.
         workers: Number of processes on this machine; None uses its number of cores; ``"ray"`` or the address of a Ray
             cluster uses the cores of the cluster (docs/guide/many.md).
-        worlds: Batch size for the jobs with prescribed activations and no pushes, which can run in batches in this
-            process on the creature's device. None uses batches of up to 1,024 on a GPU if there are at least two such
-            jobs for each core of this machine. 0 uses no batches.
+        worlds: Batch size for the jobs that can run in batches in this process on the creature's device: all jobs,
+            unless they are planned with the strategy ``paper`` or the QP solver ``daqp``. None uses batches of up to
+            1,024 on a GPU if there are at least two such jobs for each core of this machine. 0 uses no batches.
         out: Folder for trajectories, ``job-0000.npz`` and so on, which are then not held in memory.
         ended: Called when a job ends, with its number from 0 and its result.
         progress: Called after each frame with the number of finished frames and the number expected in total.
@@ -128,7 +129,7 @@ def _run_jobs(
     """Run the jobs and yield each result when it is available; batches run first."""
     if worlds is not None and worlds < 0:
         raise ArgumentError("worlds", "give the number of jobs in a batch, at least 0", value=worlds)
-    batched = [number for number, job in enumerate(jobs) if is_batchable(job)]
+    batched = [number for number, job in enumerate(jobs) if is_batchable(creature, job)]
     worlds = choose_batch_size(creature, len(batched)) if worlds is None else worlds
     batched = batched if worlds > 0 else []
     yield from run_batched(

@@ -14,14 +14,24 @@ from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.meshing.body_gaussians import centred, representatives
 from egs_warp.pipelines.segmentation_warnings import views_at_edges
+from egs_warp.render.rasteriser import render_gaussians
+from egs_warp.segmentation.above_plane import MIN_OPACITY, SceneAbovePlane
 from egs_warp.segmentation.base_plane import find_base_plane
 from egs_warp.segmentation.clicks import Click, click_at
+from egs_warp.segmentation.framing import outside_frames
 from egs_warp.segmentation.ground import measure_ground
 from egs_warp.segmentation.interactive import ClickGraph, segment_by_clicks
+from egs_warp.segmentation.object_mask import foreign_haze
 from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.plane_search import find_planes
 from egs_warp.segmentation.table_top import planes_below, surface_around
 
+_MAX_TILT, _MAX_TILT_OF_CAMERAS = 25.0, 10.0
+"""Maximum tilt of a ground relative to an up direction, and to one that follows from cameras, degrees, as in
+``locate_plane``."""
+_MAX_OUTSIDE = 0.02
+"""Share of the opaque Gaussians, averaged over the photos, that may lie outside the frames of a capture that contains
+only one object. It is 0 to 0.003 for an object on a white desk or a turntable, and 0.29 to 0.65 for rooms."""
 _MIN_SUPPORT = 0.15
 """Minimum share of the visible surface on the widest plane for it to be the ground of a scene."""
 _MAX_BELOW = 0.3
@@ -37,7 +47,9 @@ _MAX_SHARE = 1.0 / 3.0
 _MAX_EXTENT = 0.6
 """Ratio of an object's diagonal along the ground to the capture's above which the object is wide."""
 _VIEWS, _SIDE = 6, 160
-"""Number of pictures whose edges are tested, and their longer side in pixels."""
+"""Number of pictures in which an object is tested, and their longer side in pixels."""
+_MIN_COVERED = 0.01
+"""Fraction of a picture that an object covers, below which it is reported as small: photographers fill the picture."""
 _SEED_COUNT = 8
 """Number of Gaussians nearest to the middle of a scene from which the proposal starts."""
 _OPAQUE = 0.3
@@ -59,6 +71,10 @@ class Pick:
     """(3,) facing direction that the user has given; None to estimate it."""
     proposal: np.ndarray | None = None
     """(n,) bool, initial selection that the clicks change, from a file or a proposal; None for an empty one."""
+    outside: np.ndarray | None = None
+    """(n,) share of the photos whose frame does not contain a Gaussian; None if it is unknown."""
+    is_alone: bool = False
+    """True if the photos show that the capture contains nothing else."""
     is_guess: bool = False
     """True if the proposal is a guess, which a click elsewhere replaces."""
     is_plane_given: bool = False
@@ -176,7 +192,9 @@ def marked(graph: ClickGraph, pick: Pick, click: Click) -> Pick:
 
 def resegmented(graph: ClickGraph, pick: Pick) -> Pick:
     """Return ``pick`` with the Gaussians that its clicks select above its plane."""
-    return replace(pick, mask=segment_by_clicks(graph, pick.clicks, pick.plane, proposal=pick.proposal))
+    return replace(
+        pick, mask=segment_by_clicks(graph, pick.clicks, pick.plane, proposal=pick.proposal, outside=pick.outside)
+    )
 
 
 def on_table_top(graph: ClickGraph, pick: Pick) -> Pick:
@@ -200,42 +218,69 @@ def on_table_top(graph: ClickGraph, pick: Pick) -> Pick:
     return pick
 
 
-def proposed(graph: ClickGraph, up: np.ndarray, *, centre: np.ndarray | None = None) -> Pick:
+def proposed(graph: ClickGraph, up: np.ndarray, *, cameras: Sequence[Camera] = ()) -> Pick:
     """Return the proposal without any clicks: the ground and the object in the middle.
 
-    A capture without a wide plane under it is considered one object on its base.
+    A capture without a wide plane under it, and one whose opaque Gaussians are in the frames of all photos, is
+    considered one object on its base: photos of a room show surroundings that other photos do not show.
 
     Args:
         graph: the prepared capture.
         up: (3,) up direction.
-        centre: (3,) point at which the cameras look; None uses the median of the Gaussians that stand on the ground.
+        cameras: cameras of the capture, in the frame of ``graph``. The object is what they look at and what their
+            pictures contain; without them, it is in the middle of what stands on the ground.
     """
-    cloud = graph.cloud
-    opaque = cloud.opacities() > _OPAQUE
-    planes = find_planes(cloud, up)
-    plane = planes[0].plane if planes and planes[0].support > _MIN_SUPPORT else None
-    if plane is not None:
-        heights = plane.heights(graph.means[opaque])
-        if (heights < -_STANDING * np.quantile(heights, 0.99)).mean() > _MAX_BELOW:
-            plane = None
+    cloud, opaque = graph.cloud, graph.cloud.opacities() > _OPAQUE
+    middle = looked_at(cameras)
+    outside = None if middle is None else outside_frames(graph.means, middle, cameras)
+    plane = None if _is_alone(cloud, outside) else _wide_plane(graph, up, opaque, middle)
     if plane is None:
-        plane = _base_plane(cloud, up)
-        whole = plane.heights(graph.means) > 0.0
-        return Pick("object 1", plane, whole, proposal=whole, is_guess=True)
+        return replace(_whole(graph, up), is_alone=_is_alone(cloud, outside))
     heights = plane.heights(graph.means)
-    tall = float(np.quantile(heights[opaque], 0.99)) if opaque.any() else 0.0
-    standing = np.flatnonzero(opaque & (heights > max(_STANDING * tall, 0.0)))
+    standing = np.flatnonzero(opaque & (heights > max(_STANDING * float(np.quantile(heights[opaque], 0.99)), 0.0)))
     empty = Pick("object 1", plane, np.zeros(cloud.count, bool))
     if len(standing) == 0:
         return empty
-    middle = np.median(graph.means[standing], axis=0) if centre is None else centre
+    if middle is None:
+        middle = np.median(graph.means[standing], axis=0)
     away = np.linalg.norm(graph.means[standing] - middle, axis=1)
     hits = standing[np.argsort(away, kind="stable")[:_SEED_COUNT]]
-    guess = resegmented(graph, replace(empty, clicks=(Click(graph.means[hits[0]], hits),)))
+    guess = resegmented(graph, replace(empty, clicks=(Click(graph.means[hits[0]], hits),), outside=outside))
+    guess = on_table_top(graph, guess)
     if _is_large(graph, guess):
         # Half of a room is a bad proposal.
         return empty
-    return replace(guess, clicks=(), proposal=guess.mask, is_guess=True)
+    # The user's clicks may select something else, which the photos frame differently.
+    return replace(guess, clicks=(), outside=None, proposal=guess.mask, is_guess=True)
+
+
+def _is_alone(cloud: GaussianCloud, outside: np.ndarray | None) -> bool:
+    """Return True if the frames show that the capture contains only one object. ``outside`` (n,) is the share of the
+    photos whose frame does not contain a Gaussian; None if it is unknown."""
+    solid = cloud.opacities() >= MIN_OPACITY
+    return outside is not None and bool(solid.any()) and float(outside[solid].mean()) < _MAX_OUTSIDE
+
+
+def _wide_plane(graph: ClickGraph, up: np.ndarray, opaque: np.ndarray, middle: np.ndarray | None) -> Plane | None:
+    """Return the widest plane that can be the ground of a scene, below ``middle`` (3,) if that is known; None if there
+    is none."""
+    for one in find_planes(graph.cloud, up, tilt_degrees=_MAX_TILT if middle is None else _MAX_TILT_OF_CAMERAS):
+        if one.support <= _MIN_SUPPORT or not opaque.any():
+            return None
+        heights = one.plane.heights(graph.means[opaque])
+        is_low = (heights < -_STANDING * np.quantile(heights, 0.99)).mean() <= _MAX_BELOW
+        if is_low and (middle is None or one.plane.heights(middle) > 0.0):
+            return one.plane
+    return None
+
+
+def _whole(graph: ClickGraph, up: np.ndarray) -> Pick:
+    """Return the whole capture as one object on its base."""
+    plane = _base_plane(graph.cloud, up)
+    whole = plane.heights(graph.means) > 0.0
+    if whole.any():
+        whole &= ~foreign_haze(SceneAbovePlane.of(graph.cloud, plane), whole, size_of(graph, Pick("", plane, whole)))
+    return Pick("object 1", plane, whole, proposal=whole, is_guess=True)
 
 
 def _base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
@@ -267,12 +312,12 @@ def _is_large(graph: ClickGraph, pick: Pick) -> bool:
 
 
 def pick_warnings(graph: ClickGraph, pick: Pick) -> tuple[str, ...]:
-    """Return warnings about an object, each with a remedy."""
+    """Return warnings about an object, each with a remedy. The size of the only object of a capture is no warning."""
     count = int(pick.mask.sum())
     if count == 0:
         return ()
     warnings = []
-    if _is_large(graph, pick):
+    if not pick.is_alone and _is_large(graph, pick):
         share = 100.0 * count / len(pick.mask)
         warnings.append(f"it has {share:.0f} % of the capture; if other things lit up, remove them")
     size = size_of(graph, pick)
@@ -285,17 +330,23 @@ def pick_warnings(graph: ClickGraph, pick: Pick) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def edge_warnings(cloud: GaussianCloud, mask: np.ndarray, cameras: Sequence[Camera]) -> tuple[str, ...]:
+def photo_warnings(cloud: GaussianCloud, mask: np.ndarray, cameras: Sequence[Camera]) -> tuple[str, ...]:
     """Return a warning with a remedy if the object ``mask`` (n,) bool of ``cloud`` touches nearly all edges of a
-    picture, as a room does."""
+    picture, as a room does, or covers hardly any of the pictures, as a fragment does."""
     tested = [downscale(camera, _SIDE) for camera in cameras[:: max(1, len(cameras) // _VIEWS)]][:_VIEWS]
-    all_round, _ = views_at_edges(cloud.subset(mask), tested)
-    if all_round == 0:
+    if not tested or not mask.any():
         return ()
-    return (
-        f"it touches the picture's edges all round in {all_round} of {len(tested)} photos, so its surroundings are"
-        " included; remove what does not belong to it",
-    )
+    object_cloud = cloud.subset(mask)
+    all_round, _ = views_at_edges(object_cloud, tested)
+    if all_round:
+        return (
+            f"it touches the picture's edges all round in {all_round} of {len(tested)} photos, so its surroundings are"
+            " included; remove what does not belong to it",
+        )
+    covered = [float((render_gaussians(object_cloud, one).alpha.numpy() > 0.5).mean()) for one in tested]
+    if np.median(covered) < _MIN_COVERED:
+        return (f"it covers {100.0 * np.median(covered):.1f} % of the photos; if it is only a part, click on the rest",)
+    return ()
 
 
 def ground_around(
@@ -319,3 +370,15 @@ def ground_around(
         return None
     measured = measure_ground(cloud, mask, plane, cameras=cameras, centre=0.5 * (low + high), size=size)
     return None if measured.is_flat(height) else measured.field
+
+
+def looked_at(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """Return the point (3,) that is nearest to the optical axes of all ``cameras``; None for fewer than three."""
+    if len(cameras) < 3:
+        return None
+    across = [np.eye(3) - np.outer(camera.rotation[2], camera.rotation[2]) for camera in cameras]
+    centres = [camera.centre for camera in cameras]
+    matrix = np.sum(across, axis=0)
+    if np.linalg.cond(matrix) > 1e6:
+        return None
+    return np.linalg.solve(matrix, np.sum([one @ centre for one, centre in zip(across, centres, strict=True)], axis=0))

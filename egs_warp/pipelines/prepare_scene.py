@@ -46,7 +46,7 @@ _CLEARED = {
 _SOLID = 0.1
 """Minimum opacity of Gaussians that define the lowest part of an object."""
 _TRAINED = 0.6
-"""Finished fraction of the stage "segment" after the training at the plane; the estimate of the light takes the rest."""
+"""Finished fraction of the stage "segment" after the training at the plane; the light is estimated in the rest."""
 _HOVER_FRACTION = 0.03
 """Distance from the plane above which an object hovers, as a fraction of the object's size."""
 

@@ -12,7 +12,15 @@ import numpy as np
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.locomotion.rollout import FRAME_RATE, REST_FRAMES, RolloutResult, roll_out, solver_steps
+from egs_warp.locomotion.rollout import (
+    FRAME_RATE,
+    REST_FRAMES,
+    RolloutResult,
+    RunSteps,
+    rollout_steps,
+    run_with,
+    solver_steps,
+)
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.push import Push, PushKicks
@@ -278,7 +286,7 @@ class Performer:
         simulation = replace(simulation, trajectory=trajectory)
         has_frame_count = self._frames is not None if has_frame_count is None else has_frame_count
         return SimulatedRun(
-            self.creature, self.place, self.sequence, simulation, self.watch.fallen, self.pushes, has_frame_count
+            self.creature, self.place, self.sequence, simulation, self.watch.fall_note, self.pushes, has_frame_count
         )
 
 
@@ -320,6 +328,43 @@ def simulate(
     Raises:
         UserError: The body cannot perform the motion, an argument is invalid, or ``resume`` belongs to another run.
     """
+    return run_with(
+        creature.stepper,
+        simulation_steps(
+            creature,
+            motion,
+            frames=frames,
+            max_seconds=max_seconds,
+            step=step,
+            style=style,
+            pushes=pushes,
+            get_up=get_up,
+            ends_at_fall=ends_at_fall,
+            activations=activations,
+            parts=parts,
+            resume=resume,
+            progress=progress,
+        ),
+    )
+
+
+def simulation_steps(
+    creature: Creature,
+    motion: Script | str,
+    *,
+    frames: int | None = None,
+    max_seconds: float | None = None,
+    step: float | None = None,
+    style: Style | None = None,
+    pushes: Sequence[Push] = (),
+    get_up: bool = True,
+    ends_at_fall: bool = False,
+    activations: np.ndarray | None = None,
+    parts: Callable[[], Path] | None = None,
+    resume: Path | None = None,
+    progress: Callable[[int, int], object] = lambda done, expected: None,
+) -> RunSteps[SimulatedRun]:
+    """Return the steps of ``simulate``, with the same arguments, and at the end its result."""
     check_frames(frames)
     if activations is not None:
         activations = checked_activations(creature, activations, step)
@@ -333,7 +378,7 @@ def simulate(
         pushes=pushes,
         get_up=get_up and not ends_at_fall,
     )
-    simulation = roll_out(
+    simulation = yield from rollout_steps(
         creature.stepper,
         creature.geometry,
         creature.start,

@@ -15,8 +15,8 @@ from egs_warp.motions.style import Style
 from egs_warp.pipelines import simulated_run
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.simulated_run import SimulatedRun
-from egs_warp.pipelines.world import PlacedBody, World
-from egs_warp.pipelines.world_run import WorldRun, simulate_world
+from egs_warp.pipelines.world import BodyKey, World
+from egs_warp.pipelines.world_run import OtherKey, WorldRun, simulate_world
 
 
 @overload
@@ -41,13 +41,13 @@ def simulate(
 @overload
 def simulate(
     creature: World,
-    motion: Mapping[PlacedBody | str, Script | str],
+    motion: Mapping[BodyKey, Script | str],
     *,
     frames: int | None = ...,
     max_seconds: float | None = ...,
     step: float | None = ...,
     style: Style | None = ...,
-    pushes: Mapping[PlacedBody | str, Sequence[Push]] = ...,
+    pushes: Mapping[OtherKey, Sequence[Push]] = ...,
     get_up: bool = ...,
     progress: Callable[[int, int], object] = ...,
 ) -> WorldRun: ...
@@ -55,13 +55,13 @@ def simulate(
 
 def simulate(
     creature: Creature | World,
-    motion: Script | str | Mapping[PlacedBody | str, Script | str],
+    motion: Script | str | Mapping[BodyKey, Script | str],
     *,
     frames: int | None = None,
     max_seconds: float | None = None,
     step: float | None = None,
     style: Style | None = None,
-    pushes: Sequence[Push] | Mapping[PlacedBody | str, Sequence[Push]] = (),
+    pushes: Sequence[Push] | Mapping[OtherKey, Sequence[Push]] = (),
     get_up: bool = True,
     ends_at_fall: bool = False,
     activations: np.ndarray | None = None,

@@ -26,6 +26,8 @@ _MAX_DEPTH = 0.01
 """Depth in an obstacle, in body heights, up to which a body may be placed."""
 _MAX_POSITION = 1e4
 """Maximum coordinate of a place, m."""
+BodyKey = TypeVar("BodyKey", bound="PlacedBody | str")
+"""Body of a world, or its name."""
 Value = TypeVar("Value")
 
 
@@ -124,7 +126,7 @@ class World:
         """Return the body ``name``."""
         return self._members[name]
 
-    def by_name(self, values: Mapping[PlacedBody | str, Value], what: str) -> dict[str, Value]:
+    def by_name(self, values: Mapping[BodyKey, Value], what: str) -> dict[str, Value]:
         """Return ``values`` by the names of the bodies. Raises ``UserError``, which names ``what`` is given, for a
         body that is not in the world."""
         named: dict[str, Value] = {}

@@ -15,8 +15,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.capture import read_capture
 from egs_warp.io.yaml_file import check_schema, line_of, read_yaml
 from egs_warp.motions.push import Push, read_pushes
-from egs_warp.motions.script import Script
-from egs_warp.motions.script import motion as script
+from egs_warp.motions.towards import check_motion
 from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.world import World
@@ -38,8 +37,8 @@ class WorldScript:
     __repr__ = short_repr
 
     world: World
-    motions: Mapping[str, Script]
-    """Motions by the names of the creatures; creatures without a motion stand."""
+    motions: Mapping[str, str]
+    """Motions by the names of the creatures, as text; creatures without a motion stand."""
     pushes: Mapping[str, tuple[Push, ...]]
     """Pushes by the names of the creatures."""
     notes: tuple[str, ...]
@@ -72,14 +71,15 @@ def read_world(
         _check_keys(path, entry, line_of(node, ["bodies", index]))
     world = World(solids=tuple(_solid(each) for each in tree.get("obstacles", ())), friction=tree.get("friction"))
     bodies: dict[str, Creature | Prop] = {}
-    motions: dict[str, Script] = {}
+    motions: dict[str, str] = {}
     pushes: dict[str, tuple[Push, ...]] = {}
     notes: list[str] = []
     for index, entry in enumerate(entries):
         where = f"{path}, line {line_of(node, ['bodies', index])}"
         try:
             # Read first, because the bodies take longer.
-            motion = script(entry["motion"]) if "motion" in entry else None
+            if "motion" in entry:
+                check_motion(entry["motion"])
             pushes_on = read_pushes(entry["push"]) if "push" in entry else ()
             key = repr([entry.get(name) for name in _MAKER_KEYS])
             name = entry.get("name", Path(entry["capture"]).stem)
@@ -97,8 +97,8 @@ def read_world(
             )
         except UserError as error:
             raise UserError(f"{where}: {error}") from error
-        if motion is not None:
-            motions[placed.name] = motion
+        if "motion" in entry:
+            motions[placed.name] = entry["motion"]
         if pushes_on:
             pushes[placed.name] = pushes_on
     return WorldScript(world, motions, pushes, tuple(notes), tree)

@@ -2,58 +2,95 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
+from egs_warp.deformation.deformer import DeformedGaussians, Deformer
 from egs_warp.deformation.joint_deformer import JointDeformer
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.camera import Camera
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.pipelines.captured_body import points_at_rest
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.film import Filmed, encode_film, path_of, rendered_frames, split_deformer
+from egs_warp.pipelines.obstacle_cloud import Obstacles, ObstacleShadows, make_obstacles
 from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
-from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW
+from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, BodyResult
 from egs_warp.pipelines.world_run import WorldRun
+from egs_warp.render.shadow import shadow_blur_radius
+from egs_warp.short_repr import short_repr
 
 _ELEVATION = 0.35
 """Ratio of the vertical to the horizontal component of the direction to the camera, higher than for one body so that
 the ground between the bodies is visible."""
 _VIEWS = 24
 """Number of directions that are compared."""
+_LEVEL_WEIGHT = 0.4
+"""Weight of equal distances from the camera; with different distances, bodies of the same size look different."""
+_FRAMED_MARGIN = 0.15
+"""Distance from the bodies up to which obstacles are in the picture, relative to the extent of the motion."""
+_OBSTACLE_MARGIN = 1.0
+"""Distance from the bodies up to which obstacles are drawn, relative to the extent of the motion."""
 _FACING_WEIGHT = 0.6
 """Weight of the faces relative to the separation of the bodies in the choice of the view."""
 
 
 @dataclass(frozen=True)
 class WorldMotion:
-    """Nodes of all bodies in each frame of a run, for cameras (``FilmedMotion``)."""
+    """Points of all bodies in each frame of a run, for cameras (``FilmedMotion``)."""
 
     time: np.ndarray
     """(n,) s, time of each frame."""
     positions: np.ndarray
-    """(n, N, 3) m, nodes of all bodies, one body after the other."""
+    """(n, N, 3) m, points of all bodies, one body after the other: nodes of a creature, extreme points of a prop."""
     node_mass: np.ndarray
-    """(N,) kg."""
+    """(N,) kg, an equal part of the mass of its body for each point."""
     capture_frame: BodyFrame
     """Frame of the world: cameras from a file are in metres and in the axes of the world."""
 
     @classmethod
     def from_run(cls, run: WorldRun) -> WorldMotion:
         """Return the motion of all bodies of ``run``."""
-        parts = [result.simulation for result in run.results]
+        parts = [_outline(result) for result in run.results]
+        counts = [part.shape[1] for part in parts]
+        masses = [np.full(count, each.body.body.mass / count) for count, each in zip(counts, run.results, strict=True)]
         return cls(
-            run.time,
-            np.concatenate([part.trajectory.positions[part.frames] for part in parts], axis=1),
-            np.concatenate([part.trajectory.node_mass for part in parts]),
-            BodyFrame(np.eye(3), np.zeros(3), 1.0),
+            run.time, np.concatenate(parts, axis=1), np.concatenate(masses), BodyFrame(np.eye(3), np.zeros(3), 1.0)
         )
 
 
-def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | None = None) -> Camera:
-    """Return a fixed camera that shows all bodies during the whole run.
+@dataclass(frozen=True)
+class WorldFilm:
+    """File, Gaussians and camera of the film of a world."""
+
+    __repr__ = short_repr
+
+    file: str
+    """Name of the video in the folder of the run."""
+    deformers: Mapping[str, Deformer]
+    """Deformer of the Gaussians of each body after splitting, by the name of the body."""
+    camera: Camera
+    """Fixed camera of the film."""
+
+
+def _outline(result: BodyResult) -> np.ndarray:
+    """Return points (n, N, 3) m of a body in each frame. The nodes of a prop are not near its surface, so extreme
+    points of its surface are returned instead."""
+    body, simulation = result.body, result.simulation
+    positions = simulation.trajectory.positions[simulation.frames]
+    if len(body.mesh.tets) > 1:
+        return positions
+    directions = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    extreme = np.unique(np.argmax(directions @ points_at_rest(body.geometry).T, axis=1))
+    return np.einsum("pw,fwi->fpi", body.geometry.weights[extreme], positions[:, body.mesh.tets[0]])
+
+
+def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | np.ndarray | None = None) -> Camera:
+    """Return a fixed camera that shows all bodies, and obstacles near them, during the whole run.
 
     By default it looks from the direction in which the bodies hide each other least and the creatures face the camera.
 
@@ -63,6 +100,12 @@ def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | None = N
         view_from: (3,) Direction to the camera in the axes of the world.
     """
     points = WorldMotion.from_run(run).positions.reshape(-1, 3)
+    obstacles = _obstacles(run, points)
+    if obstacles is not None:
+        near = obstacles.cloud.means.numpy().astype(np.float64)
+        low, high = points.min(axis=0), points.max(axis=0)
+        margin = _FRAMED_MARGIN * float((high - low).max())
+        points = np.concatenate([points, near[((near > low - margin) & (near < high + margin)).all(axis=1)]])
     direction = _clearest_view(run) if view_from is None else np.asarray(view_from, float)
     direction = direction / np.linalg.norm(direction)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -85,11 +128,11 @@ def draw_world_film(
     name: str = "world",
     size: int = 512,
     shot: Shot | None = None,
-    view_from: Sequence[float] | None = None,
+    view_from: Sequence[float] | np.ndarray | None = None,
     shadow: bool = True,
     quiet: bool = False,
-) -> str:
-    """Render a simulated world and write its video and ``sheet.png``; return the name of the video.
+) -> WorldFilm:
+    """Render a simulated world and write its video and ``sheet.png``.
 
     Args:
         run: The simulated world.
@@ -106,16 +149,40 @@ def draw_world_film(
     steps = np.arange(len(motion.time)) if shot.fps == FRAME_RATE else nearest_steps(motion.time, shot.fps)
     camera = resized(world_camera(run, size, view_from), *(shot.size or (size, size)))
     cameras = shot.cameras(camera, motion, steps)
-    deformer = JointDeformer([split_deformer(result) for result in run.results])
+    obstacles = _obstacles(run, motion.positions.reshape(-1, 3))
+    deformers = {name: split_deformer(result) for name, result in run.bodies.items()}
+    deformer = JointDeformer(tuple(deformers.values()), fixed=None if obstacles is None else obstacles.cloud)
     simulations = [result.simulation for result in run.results]
     poses = ([each.trajectory.positions[each.frames[step]] for each in simulations] for step in steps)
     filmed = Filmed(
         np.concatenate([path_of(each.trajectory) for each in simulations]),
         max(each.trajectory.height for each in simulations),
     )
-    frames = rendered_frames(deformer.deform, deformer.rest, poses, filmed, cameras, shot, shadow=shadow)
+    deform = deformer.deform
+    if obstacles is not None and shadow:
+        count = deformer.rest.count - obstacles.cloud.count
+        shadows = ObstacleShadows(obstacles, count, blur_radius=shadow_blur_radius(deformer.rest), height=filmed.height)
+        deform = partial(_deform_with_shadows, deformer, shadows)
+    frames = rendered_frames(deform, deformer.rest, poses, filmed, cameras, shot, shadow=shadow)
     path, _ = encode_film(frames, folder, name, cameras[0], shot, motion.time[steps], quiet=quiet)
-    return path.name
+    return WorldFilm(path.name, deformers, camera)
+
+
+def _deform_with_shadows(
+    deformer: JointDeformer, shadows: ObstacleShadows, poses: Sequence[np.ndarray]
+) -> DeformedGaussians:
+    """Deform all bodies and draw their shadows on the obstacles."""
+    deformed = deformer.deform(poses)
+    shadows.draw(deformed.cloud)
+    return deformed
+
+
+def _obstacles(run: WorldRun, points: np.ndarray) -> Obstacles | None:
+    """Return the obstacles around ``points`` (n, 3) of the bodies; None if there are no obstacles."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = _OBSTACLE_MARGIN * float((high - low).max())
+    device = str(run.results[0].body.cloud.device)
+    return make_obstacles(run.world.solids, low - margin, high + margin, device=device)
 
 
 def _clearest_view(run: WorldRun) -> np.ndarray:
@@ -125,15 +192,17 @@ def _clearest_view(run: WorldRun) -> np.ndarray:
     radii = [0.5 * float(np.ptp(each.trajectory.positions[0][:, :2], axis=0).max()) for each in simulations]
     faces = [result.body.front.direction[:2] for result in run.results if isinstance(result.body, Creature)]
     first, second = np.triu_indices(len(simulations), 1)
-    reach = np.array(radii)[first] + np.array(radii)[second]
+    between, reach = paths[first] - paths[second], np.array(radii)[first] + np.array(radii)[second]
     angles = 2.0 * np.pi * (np.arange(_VIEWS) + 0.5) / _VIEWS
     best, best_score = angles[0], -np.inf
     for angle in angles:
         towards, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
-        apart = np.abs((paths[first] - paths[second]) @ across)
+        apart = np.abs(between @ across)
         separation = float(np.minimum(apart / reach[:, None], 1.0).mean()) if len(first) else 1.0
+        level = float((apart / np.maximum(np.linalg.norm(between, axis=2), 1e-9)).mean()) if len(first) else 1.0
         # A three-quarter view shows a face best.
-        facing = float(np.mean([min(face @ towards, 0.8) for face in faces])) if faces else 0.0
-        if separation + _FACING_WEIGHT * facing > best_score:
-            best, best_score = angle, separation + _FACING_WEIGHT * facing
+        facing = float(np.minimum(np.array(faces) @ towards, 0.8).mean()) if faces else 0.0
+        score = separation + _LEVEL_WEIGHT * level + _FACING_WEIGHT * facing
+        if score > best_score:
+            best, best_score = angle, score
     return np.array([np.cos(best), np.sin(best), _ELEVATION])

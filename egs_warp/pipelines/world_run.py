@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,13 +21,15 @@ from egs_warp.motions.script import Script
 from egs_warp.motions.sequence import MotionRecord
 from egs_warp.motions.stance import RestDetector
 from egs_warp.motions.style import Style
-from egs_warp.pipelines.creature import Creature
+from egs_warp.motions.towards import OtherBody, script_among
+from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.end_state import EndCause
 from egs_warp.pipelines.prop import Prop
 from egs_warp.pipelines.simulated_run import BodyResult, Performer, SimulatedRun, check_frames
-from egs_warp.pipelines.world import PlacedBody, World
+from egs_warp.pipelines.world import BodyKey, PlacedBody, World
 from egs_warp.short_repr import short_repr
 
+OtherKey = TypeVar("OtherKey", bound=PlacedBody | str)
 STANDING = "stand"
 """Motion of a creature without one."""
 _PROP_TIME = 10.0
@@ -117,13 +121,13 @@ class PassiveMotion:
 
 def simulate_world(
     world: World,
-    motions: Mapping[PlacedBody | str, Script | str],
+    motions: Mapping[BodyKey, Script | str],
     *,
     frames: int | None = None,
     max_seconds: float | None = None,
     step: float | None = None,
     style: Style | None = None,
-    pushes: Mapping[PlacedBody | str, Sequence[Push]] | None = None,
+    pushes: Mapping[OtherKey, Sequence[Push]] | None = None,
     get_up: bool = True,
     progress: Callable[[int, int], object] = lambda done, expected: None,
 ) -> WorldRun:
@@ -132,7 +136,7 @@ def simulate_world(
     if not world.members:
         raise UserError("world: it has no body; add a creature or a prop")
     scripts = world.by_name(motions, "motion")
-    pushes_on = world.by_name(pushes or {}, "pushes")
+    pushes_on = {} if pushes is None else world.by_name(pushes, "pushes")
     for name in [*scripts, *pushes_on]:
         if isinstance(world.member(name).body, Prop):
             raise UserError(f"{name}: it is a prop, which has no muscles and no motion; make it with make_creature")
@@ -140,13 +144,23 @@ def simulate_world(
     performers: dict[str, Performer] = {}
     passive: dict[str, PassiveMotion] = {}
     runs: list[BodyRun] = []
+    index = {member.name: number for number, member in enumerate(world.members)}
+
+    def others(name: str) -> dict[str, OtherBody]:
+        """Return the other bodies as the creature ``name`` sees them."""
+        return {
+            member.name: OtherBody(member.body.body, partial(_state_of, member, runs, index[member.name]))
+            for member in world.members
+            if member.name != name
+        }
+
     for member in world.members:
         name, body = member.name, member.body
         if isinstance(body, Creature):
             try:
                 performer = performers[name] = Performer(
                     body,
-                    scripts.get(name, STANDING),
+                    _script(scripts.get(name, STANDING), body, others(name), dt),
                     frames=frames,
                     max_seconds=max_seconds,
                     step=dt,
@@ -184,3 +198,15 @@ def simulate_world(
             assert isinstance(member.body, Prop)
             bodies[member.name] = PropRun(member.body, result)
     return WorldRun(world, bodies)
+
+
+def _script(motion: Script | str, body: Creature, others: Mapping[str, OtherBody], dt: float) -> Script:
+    """Return the script of a creature; its text may name ``others``."""
+    if isinstance(motion, Script):
+        return motion
+    return script_among(motion, others, initial_stance(body, step=dt))
+
+
+def _state_of(member: PlacedBody, runs: Sequence[BodyRun], index: int) -> BodyState:
+    """Return the current state of a body, whose run may not have begun yet."""
+    return runs[index].state if index < len(runs) else member.body.start

@@ -18,7 +18,7 @@ from egs_warp.segmentation.plane_search import lies_along
 
 CELLS = 64
 """Number of grid cells across the object in the connectivity test."""
-_MIN_OPACITY = 0.1
+MIN_OPACITY = 0.1
 """Minimum opacity of Gaussians that connect others. Fainter ones are assigned with their surroundings."""
 _MIN_DETACHED_HEIGHT = 0.1
 """Height of the lowest point, as a fraction of the object's size, above which a part does not stand on the ground."""
@@ -59,7 +59,7 @@ class SceneAbovePlane:
         means, opacity = cloud.means.numpy().astype(np.float64), cloud.opacities()
         level = lies_along(cloud, plane)
         flat = means @ np.stack(plane.tangents(), axis=1)
-        return cls(cloud, plane, means, flat, plane.heights(means), opacity, opacity >= _MIN_OPACITY, level)
+        return cls(cloud, plane, means, flat, plane.heights(means), opacity, opacity >= MIN_OPACITY, level)
 
     def is_under(self, chosen: np.ndarray, height: float, size: float) -> np.ndarray:
         """Return (n,) bool, True for Gaussians under the object's low parts: inside the outline, seen along the normal,

@@ -16,9 +16,9 @@ from egs_warp.segmentation.object_spec import ObjectSpec
 
 _MIN_PHOTOS, _MAX_PHOTOS = 8, 32
 """Number of photos below which framing gives no information, and number above which photos are sampled evenly."""
-_MAX_SHARE = 0.1
-"""Maximum share of the photos of the object in whose frame a background Gaussian may lie. Shares from 0.1 to 0.5 give
-the same object for a bear on a duvet; a small share keeps objects that were photographed in parts."""
+_MIN_OUTSIDE = 0.9
+"""Minimum share of the photos of the object whose frame does not contain a background Gaussian. Shares from 0.5 to 0.9
+give the same object for a bear on a duvet; a large share keeps objects that were photographed in parts."""
 _HITS, _SOLID = 8, 0.3
 """Number of Gaussians next to a point that represent a click there, and their minimum opacity."""
 
@@ -36,24 +36,35 @@ def with_framing(cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camer
     """
     if spec.point is None or spec.masks:
         return spec
-    showing = [camera for camera in cameras if _in_frame(spec.point[None], camera)[0]]
-    if len(showing) < _MIN_PHOTOS:
-        return spec
-    showing = showing[:: -(-len(showing) // _MAX_PHOTOS)]
     means = cloud.means.numpy().astype(np.float64)
-    share = sum(_in_frame(means, camera).astype(np.float64) for camera in showing) / len(showing)
-    background = np.flatnonzero(share <= _MAX_SHARE)
-    if len(background) == 0:
+    outside = outside_frames(means, spec.point, cameras)
+    background = np.zeros(len(means), bool) if outside is None else outside >= _MIN_OUTSIDE
+    if not background.any():
         return spec
     clicks = spec.clicks
     if not any(click.inside for click in clicks):
-        solid = np.flatnonzero((cloud.opacities() > _SOLID) & (share > _MAX_SHARE))
+        solid = np.flatnonzero((cloud.opacities() > _SOLID) & ~background)
         if len(solid) == 0:
             return spec
         nearest = KDTree(means[solid]).query(spec.point, k=min(_HITS, len(solid)))[1]
         clicks = (Click(spec.point, solid[np.ravel(nearest)]), *clicks)
     wanted = np.concatenate([click.hits for click in clicks if click.inside])
-    return replace(spec, clicks=(*clicks, Click(spec.point, np.setdiff1d(background, wanted), inside=False)))
+    return replace(
+        spec, clicks=(*clicks, Click(spec.point, np.setdiff1d(np.flatnonzero(background), wanted), inside=False))
+    )
+
+
+def outside_frames(means: np.ndarray, point: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray | None:
+    """Return (n,), the share of the photos of ``point`` (3,) whose frame does not contain the ``means`` (n, 3); None
+    if there are few such photos."""
+    showing = [camera for camera in cameras if _in_frame(point[None], camera)[0]]
+    if len(showing) < _MIN_PHOTOS:
+        return None
+    showing = showing[:: -(-len(showing) // _MAX_PHOTOS)]
+    inside = np.zeros(len(means))
+    for camera in showing:
+        inside += _in_frame(means, camera)
+    return 1.0 - inside / len(showing)
 
 
 def _in_frame(points: np.ndarray, camera: Camera) -> np.ndarray:

@@ -39,12 +39,30 @@ class SplatGraph:
     """(m,) distance between the ends, divided by the median of all links; longer if colours differ."""
     strength: np.ndarray
     """(m,) 0 to 1, cost of cutting the link."""
+    colour_unit: float = 1.0
+    """Mean difference of the colours, 0 to 1, of the ends of a link between neighbours."""
 
     @classmethod
-    def of(cls, cloud: GaussianCloud, chosen: np.ndarray) -> SplatGraph:
-        """Link the ``chosen`` (n,) Gaussians, indices of ``cloud``."""
+    def of(cls, cloud: GaussianCloud, chosen: np.ndarray, *, neighbours: int = _NEIGHBOURS) -> SplatGraph:
+        """Link each of the ``chosen`` (n,) Gaussians, indices of ``cloud``, to its nearest ``neighbours``.
+
+        Training stacks Gaussians at one place, whose nearest neighbours are one another. Therefore only one Gaussian of
+        each place (``distinct_places``) is linked to the neighbours, and the others are linked to that one.
+        """
         points = cloud.means.numpy()[chosen].astype(np.float64)
-        return cls.linking(points, cloud.sh.numpy()[chosen, 0].astype(np.float64) * SH_BAND_0 + 0.5)
+        colours = cloud.sh.numpy()[chosen, 0].astype(np.float64) * SH_BAND_0 + 0.5
+        first, place = distinct_places(points, cloud.breadths(chosen))
+        graph = cls.linking(points[first], colours[first], neighbours=neighbours)
+        others = np.setdiff1d(np.arange(len(points)), first).astype(np.int32)
+        apart = np.linalg.norm(colours[others] - colours[first[place[others]]], axis=1) / graph.colour_unit
+        return cls(
+            len(points),
+            np.concatenate([first[graph.first], first[place[others]]]).astype(np.int32),
+            np.concatenate([first[graph.second], others]).astype(np.int32),
+            np.concatenate([graph.length, np.zeros(len(others))]),
+            np.concatenate([graph.strength, np.exp(-0.5 * apart**2)]),
+            graph.colour_unit,
+        )
 
     @classmethod
     def linking(cls, points: np.ndarray, colours: np.ndarray, *, neighbours: int = _NEIGHBOURS) -> SplatGraph:
@@ -61,9 +79,9 @@ class SplatGraph:
         # Encode each pair as one number: sorting rows takes ten times as long.
         first, second = np.divmod(np.unique(ends[0] * count + ends[1]), count)
         first, second = first.astype(np.int32), second.astype(np.int32)
-        away, apart = _differences(points, colours, first, second)
+        away, apart, unit = _differences(points, colours, first, second)
         strength = np.exp(-0.5 * apart**2) / np.maximum(away, 1.0)
-        return cls(count, first, second, away * (1.0 + _DETOUR * apart), strength)
+        return cls(count, first, second, away * (1.0 + _DETOUR * apart), strength, unit)
 
     def clustered(self, cluster: np.ndarray, points: np.ndarray, colours: np.ndarray) -> SplatGraph:
         """Return the graph of clusters. A link is as strong as all links between its two clusters together.
@@ -78,9 +96,9 @@ class SplatGraph:
         between = low != high
         codes, link = np.unique(low[between] * count + high[between], return_inverse=True)
         first, second = (ends.astype(np.int32) for ends in np.divmod(codes, count))
-        away, apart = _differences(points, colours, first, second)
+        away, apart, unit = _differences(points, colours, first, second)
         strength = np.bincount(link, weights=self.strength[between], minlength=len(codes))
-        return SplatGraph(count, first, second, away * (1.0 + _DETOUR * apart), strength)
+        return SplatGraph(count, first, second, away * (1.0 + _DETOUR * apart), strength, unit)
 
     def where(self, chosen: np.ndarray) -> SplatGraph:
         """Return the graph with only the ``chosen`` (m,) bool links."""
@@ -147,14 +165,33 @@ class SplatGraph:
         return connected_components(links, directed=False)[1]
 
 
+def distinct_places(points: np.ndarray, breadths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find Gaussians of similar breadth that lie at one place: in one cell of a grid about as fine as their breadth.
+
+    Args:
+        points: (n, 3) means.
+        breadths: (n,) breadths, in the unit of ``points``.
+
+    Returns:
+        (k,) int, the first Gaussian of each place, and (n,) int, the place of each Gaussian.
+    """
+    if len(points) == 0:
+        return np.zeros(0, int), np.zeros(0, int)
+    unit = float(np.median(breadths))
+    octave = np.floor(np.log2(np.maximum(breadths / unit, 1e-6)))
+    cell = np.floor((points - points.min(axis=0)) / (unit * np.exp2(octave))[:, None])
+    _, first, place = np.unique(np.column_stack([octave, cell]), axis=0, return_index=True, return_inverse=True)
+    return first, np.ravel(place)
+
+
 def _differences(
     points: np.ndarray, colours: np.ndarray, first: np.ndarray, second: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Return, for each link, the distance between its ends divided by the median, and the difference of their colours
-    divided by the mean."""
+    divided by the mean; and that mean."""
     away = np.linalg.norm(points[first] - points[second], axis=1)
     apart = np.linalg.norm(colours[first] - colours[second], axis=1)
-    if len(away):
-        away /= max(float(np.median(away)), 1e-30)
-        apart /= max(float(np.mean(apart)), 1e-6)
-    return away, apart
+    if len(away) == 0:
+        return away, apart, 1.0
+    unit = max(float(np.mean(apart)), 1e-6)
+    return away / max(float(np.median(away)), 1e-30), apart / unit, unit

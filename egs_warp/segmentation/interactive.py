@@ -17,13 +17,11 @@ from scipy.spatial.transform import Rotation
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
-from egs_warp.segmentation.above_plane import SceneAbovePlane
+from egs_warp.segmentation.above_plane import MIN_OPACITY, SceneAbovePlane
 from egs_warp.segmentation.clicks import Click
 from egs_warp.segmentation.floor_remnants import floor_remnants
 from egs_warp.segmentation.graph_cut import SplatGraph
 
-_MIN_OPACITY = 0.1
-"""Minimum opacity of Gaussians that link others. Fainter ones follow the nearest opaque one."""
 _NEIGHBOURS = 6
 """Number of nearest neighbours to which a Gaussian is linked."""
 _SIGMAS, _MAX_GAP = 3.0, 2.0
@@ -75,13 +73,14 @@ class ClickGraph:
     def of(cls, cloud: GaussianCloud) -> ClickGraph:
         """Prepare ``cloud``: five seconds for 300,000 Gaussians on one core."""
         means = cloud.means.numpy().astype(np.float64)
-        opaque = cloud.opacities() >= _MIN_OPACITY
+        opaque = cloud.opacities() >= MIN_OPACITY
         if not opaque.any():
             opaque[:] = True
         points = means[opaque]
         colours = cloud.sh.numpy()[opaque, 0].astype(np.float64) * SH_BAND_0 + 0.5
-        links = SplatGraph.linking(points, colours, neighbours=_NEIGHBOURS)
-        links = links.where(_gaps(cloud, np.flatnonzero(opaque), links) < _MAX_GAP)
+        nodes = np.flatnonzero(opaque)
+        links = SplatGraph.of(cloud, nodes, neighbours=_NEIGHBOURS)
+        links = links.where(_gaps(cloud, nodes, links) < _MAX_GAP)
         own = _clusters(points, np.clip(colours, 0.0, 1.0))
         # A cluster is a box, which may hold a part of the object and a floater far from it.
         parts = links.parts(np.ones(len(own), bool)).astype(np.int64)
@@ -106,6 +105,7 @@ def segment_by_clicks(
     ground: Plane | HeightField,
     *,
     proposal: np.ndarray | None = None,
+    outside: np.ndarray | None = None,
 ) -> np.ndarray:
     """Find the Gaussians of the object that the clicks describe.
 
@@ -120,6 +120,9 @@ def segment_by_clicks(
             same place, the later one counts.
         ground: the ground, in the frame of the capture.
         proposal: (n,) bool, Gaussians that belong to the object unless clicks beside it remove them; None for none.
+        outside: (n,) 0 to 1, share of the photos of the object whose frame does not contain a Gaussian; None if it is
+            unknown. Photographers keep the object in the picture, so in these photos the Gaussian's links lead out of
+            the object.
 
     Returns:
         (n,) bool, True for the object's Gaussians; all False without a click on it and without a proposal.
@@ -136,7 +139,7 @@ def segment_by_clicks(
     # The first round measures the size of the object.
     for _ in range(2):
         standing = (heights > foot) & ~(level & (heights < _LEVEL_FOOT * foot))
-        chosen, linked = _chosen(graph, hits, others, standing, flat, proposal)
+        chosen, linked = _chosen(graph, hits, others, standing, flat, proposal, outside)
         if not chosen.any():
             return chosen
         size = float(np.linalg.norm(np.subtract(*np.quantile(graph.means[chosen], [0.995, 0.005], axis=0))))
@@ -150,6 +153,13 @@ def segment_by_clicks(
     for hit in hits:
         remnants[hit] = False
     return chosen & ~remnants
+
+
+def _outside(graph: ClickGraph, outside: np.ndarray) -> np.ndarray:
+    """Return the mean (k,) of ``outside`` (n,) over the Gaussians of each cluster."""
+    return np.bincount(graph.cluster, weights=outside, minlength=graph.links.count) / np.bincount(
+        graph.cluster, minlength=graph.links.count
+    )
 
 
 def _consistent_hits(graph: ClickGraph, clicks: Sequence[Click]) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -172,6 +182,7 @@ def _chosen(
     standing: np.ndarray,
     flat: np.ndarray,
     proposal: np.ndarray | None,
+    outside: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (n,) bool, the object, and (n,) bool, the Gaussians that link others, a subset of the ``standing`` (n,)
     bool ones. ``flat`` (k, 2) are the coordinates of the clusters along the ground."""
@@ -183,6 +194,8 @@ def _chosen(
         alive[seed] = True
     links, number = graph.links.among(alive), np.cumsum(alive) - 1
     at_ground = _GROUND_WEIGHT * graph.links.strength_to(~alive)[alive]
+    if outside is not None:
+        at_ground = at_ground + _outside(graph, outside)[alive] * links.strength_to(np.ones(links.count, bool))
     seeds = [number[seed] for seed in seeds]
     extent = _MAX_EXTENT * float(np.linalg.norm(np.subtract(*np.quantile(flat, [0.99, 0.01], axis=0))))
     inside = np.zeros(links.count, bool)
@@ -287,7 +300,9 @@ def _gaps(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph) -> np.ndar
         )
         for ends in (links.first, links.second)
     )
-    return (lengths - _SIGMAS * sum(extents)) / max(float(np.median(lengths)), 1e-30) if len(lengths) else lengths
+    # Links within one place have no length.
+    typical = float(np.median(lengths[links.length > 0.0])) if (links.length > 0.0).any() else 1.0
+    return (lengths - _SIGMAS * sum(extents)) / max(typical, 1e-30)
 
 
 def _clusters(points: np.ndarray, colours: np.ndarray) -> np.ndarray:

@@ -188,6 +188,17 @@ def _of_size(
     return Segmentation(object_mask, buried, floaters, size)
 
 
+def foreign_haze(scene: SceneAbovePlane, object_mask: np.ndarray, size: float) -> np.ndarray:
+    """Return (n,) bool, True for the haze in ``object_mask`` (n,) bool that is neither inside the object, whose size is
+    ``size`` (scene units), nor near it with similar colours."""
+    result = np.zeros_like(object_mask)
+    haze = _haze_indices(scene, np.flatnonzero(object_mask), size)
+    solid = object_mask & scene.is_opaque
+    solid[haze] = False
+    result[haze] = ~_is_own_haze(scene, haze, solid, size)
+    return result
+
+
 def _haze_indices(scene: SceneAbovePlane, object_indices: np.ndarray, size: float) -> np.ndarray:
     """Return (k,) int, the indices of the haze among the Gaussians ``object_indices`` (m,)."""
     across = scene.cloud.breadths(object_indices)

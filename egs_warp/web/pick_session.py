@@ -29,10 +29,10 @@ from egs_warp.pipelines.pick import (
     Pick,
     PickHistory,
     PickState,
-    edge_warnings,
     ground_around,
     marked,
     on_table_top,
+    photo_warnings,
     pick_warnings,
     proposed,
     resegmented,
@@ -101,8 +101,6 @@ class PickSource:
     commands: PickCommands
     first: Callable[[], Sequence[PickedObject]] = tuple
     """Returns the initial objects, in the frame of the capture: from a file or from the command line."""
-    centre: np.ndarray | None = None
-    """(3,) point in the frame of the page at which its initial camera looks."""
     cameras: Sequence[Camera] = ()
     """Cameras of the capture, in the capture's frame; empty if they are unknown."""
     film: str | None = None
@@ -224,8 +222,8 @@ class PickSession:
         if given:
             state = PickState(tuple(self._from_file(one) for one in given))
         else:
-            centre = self.source.centre
-            state = PickState((proposed(self._graph, np.array([0.0, 0.0, 1.0]), centre=centre),))
+            cameras = [self.source.frame.camera(one) for one in self.source.cameras]
+            state = PickState((proposed(self._graph, np.array([0.0, 0.0, 1.0]), cameras=cameras),))
         self._history = PickHistory(state)
         self._set_busy("")
         self._show()
@@ -355,7 +353,7 @@ class PickSession:
         if not pick.mask.any():
             return _NO_BODY
         placed = self.source.placed
-        warnings = edge_warnings(self.source.cloud, pick.mask, self.source.cameras)
+        warnings = photo_warnings(self.source.cloud, pick.mask, self.source.cameras)
         above = pick.mask & (pick.plane.heights(placed.means.numpy()) > 0.0)
         if not above.any():
             return _NO_BODY

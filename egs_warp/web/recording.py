@@ -10,8 +10,9 @@ import numpy as np
 
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
-from egs_warp.geometry.main_light import mean_irradiance
+from egs_warp.geometry.main_light import normalised
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.io.planes import light_to_json
 from egs_warp.lighting.surface_normals import surface_normals
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
@@ -138,11 +139,7 @@ def creature_header(
         arrays |= splat_arrays("scene", scene)
     light = render_data.light
     if light is not None:
-        facts["light"] = {
-            "direction": light.direction.tolist(),
-            "shade": light.shade,
-            "irradiance": (light.irradiance / mean_irradiance(light)).ravel().tolist(),
-        }
+        facts["light"] = light_to_json(normalised(light))
         arrays["splats_normals"] = np.rint(128.0 + 127.0 * surface_normals(render_data.splats)).astype(np.uint8)
     return header(facts, arrays)
 

@@ -65,6 +65,11 @@ def _block(text: dict[str, Any]) -> dict[str, Any]:
     return text["bodies"][0]["blocks"][1]
 
 
+def _light(**changes: Any) -> dict[str, Any]:
+    flat = [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
+    return {"direction": [0, 0, 1], "half_angle": 5, "shade": 0.2, "irradiance": flat, **changes}
+
+
 def _double(entry: dict[str, Any]) -> None:
     entry["step"] = [0.1 * step for step in entry["step"]]
 
@@ -88,6 +93,10 @@ def _double(entry: dict[str, Any]) -> None:
             "bodies/0: bands are not uint8 with",
         ),
         (lambda t: _arrays(t)["bands"].update(lower=[0] * 3), "bodies/0: lower of bands is not -128 steps"),
+        (lambda t: t.update(light={"direction": [0, 0, 1]}), "light: 'half_angle' is a required property"),
+        (lambda t: t.update(light=_light(direction=[0, 0, 2])), "the light is invalid"),
+        (lambda t: t.update(light=_light(shade=1)), "light/shade: 1 is greater than or equal to the maximum of 1"),
+        (lambda t: _arrays(t).update(normals=_arrays(t)["means"]), "bodies/0/normals: its bytes overlap"),
         (lambda t: t["bodies"].reverse(), "the arrays are not in order: those of all bodies, then the first blocks"),
         (lambda t: t["bodies"][1].update(count=6), "bodies/1: means has shape [7, 3], not [6, 3]"),
         (lambda t: _block(t).update(first=59), "bodies/0: blocks/1: begins at frame 59, not 60"),

@@ -73,6 +73,16 @@ def test_a_run_that_slides_passes() -> None:
     assert result.newton_unconverged == result.inverted_elements == 0 and result.penetration < 5e-3
 
 
+def test_contacts_with_other_bodies_are_external_forces() -> None:
+    """Their forces enter the momenta; their slip and gap are unknown, so friction and complementarity skip them."""
+    t = slide().trajectory()
+    others = replace(t, contact_plane=np.full_like(t.contact_plane, -3))
+    sliding_on_ground, pushed = audit(t), audit(others)
+    assert pushed.momentum_residual == sliding_on_ground.momentum_residual
+    assert pushed.energy_residual == sliding_on_ground.energy_residual
+    assert pushed.friction_gap == pushed.complementarity_gap == 0.0
+
+
 def test_a_missing_misplaced_or_late_push_is_detected() -> None:
     """The body is pushed by a blow on one side and by wind. If the blow is distributed over all nodes instead, the
     linear momentum is still correct, but angular momentum and energy are not."""

@@ -18,7 +18,7 @@ from egs_warp.motions.script import motion
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.simulated_run import simulate
-from tests.support.creatures import coarse_pawn
+from tests.support.creatures import coarse_pawn, on_its_rim
 from tests.support.waves import wavy_ground
 
 FRICTIONS = (0.8, 0.3, 1.2)
@@ -59,7 +59,7 @@ def runs_together(stepper: BatchStepper, starts: list[BodyState], activations: n
     runs: list[list[list[StepReport]]] = [[] for _ in starts]
     state = stepper.start(starts)
     for given in activations:
-        state, done, lost = stepper.advance(state, given, dt)
+        state, done, lost = stepper.advance_with_activations(state, given, dt)
         assert not lost.any()
         for run in runs:
             run.append([])
@@ -136,18 +136,6 @@ def parts(creature: Creature) -> tuple[SoftBody, MuscleSet, ContactGeometry]:
     return creature.body, creature.muscles, creature.stepper.geometry
 
 
-def on_its_rim(geometry: ContactGeometry, count: int = 12) -> ContactGeometry:
-    """Return the geometry with only ``count`` contact points of the base, the outermost in all directions."""
-    corners = geometry.mesh.nodes[geometry.mesh.tets[geometry.tet_from_point]]
-    places = np.einsum("pw,pwi->pi", geometry.weights, corners)
-    heights = geometry.ground_heights(places)
-    base = np.flatnonzero(heights < 0.01)
-    angles = 2.0 * np.pi * np.arange(count) / count
-    reach = (places[base, :2] - places[base, :2].mean(axis=0)) @ np.stack([np.cos(angles), np.sin(angles)])
-    chosen = np.unique(base[np.argmax(reach, axis=0)])
-    return replace(geometry, tet_from_point=geometry.tet_from_point[chosen], weights=geometry.weights[chosen])
-
-
 def rough(creature: Creature) -> tuple[list[BodyState], np.ndarray, float]:
     """Return start states, activations (2, 3, M), m, and the step size, s, of three worlds. The bodies of the first and
     the last one hit the ground with random muscle activations; the middle one stands. The steps are too long."""
@@ -182,7 +170,7 @@ def test_a_world_continues_from_its_last_step(creature: Creature, jump: Trajecto
         assert count > 4 and int(state.counts[world]) == count
         assert np.array_equal(state.points[world, :count].numpy(), memory.points)
         assert np.array_equal(state.forces[world, :count].numpy(), memory.forces)
-    _, done, _ = beside.advance(state, np.stack([jump.activations[FIRST + 1]] * 2), dt)
+    _, done, _ = beside.advance_with_activations(state, np.stack([jump.activations[FIRST + 1]] * 2), dt)
     (step,) = done
     for report, (other,) in zip(step.reports(), expected, strict=True):
         check(creature, report, other)
@@ -220,7 +208,7 @@ def test_a_world_does_not_depend_on_the_others(creature: Creature) -> None:
         stepper = BatchStepper(creature.body, creature.muscles, geometry, FRICTIONS)
         state = stepper.start(states)
         for row in muscles:
-            state, _, _ = stepper.advance(state, row[state.worlds], dt)
+            state, _, _ = stepper.advance_with_activations(state, row[state.worlds], dt)
         ends.append(state.positions[state.worlds.tolist().index(1)].numpy())
     for end in ends[1:]:
         np.testing.assert_allclose(end, ends[0], rtol=0, atol=1e-13 * creature.body.height)
@@ -248,10 +236,10 @@ def test_a_world_that_cannot_be_solved_is_reported_and_removed(creature: Creatur
     stepper = BatchStepper(*parts(creature), FRICTIONS)
     state = stepper.start([creature.start, broken, creature.start])
     given = np.zeros((3, creature.muscles.segment_count))
-    state, done, lost = stepper.advance(state, given, dt)
+    state, done, lost = stepper.advance_with_activations(state, given, dt)
     assert lost.tolist() == [False, True, False] and state.worlds.tolist() == [0, 2]
     assert [step.worlds.tolist() for step in done] == [[0, 2]]
-    state, done, lost = stepper.advance(state, given[:2], dt)
+    state, done, lost = stepper.advance_with_activations(state, given[:2], dt)
     assert not lost.any() and torch.isfinite(state.positions).all()
 
 
@@ -262,5 +250,5 @@ def test_a_world_that_never_converges_is_reported(creature: Creature) -> None:
     stepper = BatchStepper(*parts(creature), FRICTIONS)
     stepper.solver = replace(stepper.solver, tolerance=0.0)
     given = np.zeros((3, creature.muscles.segment_count))
-    state, done, lost = stepper.advance(stepper.start([creature.start] * 3), given, dt)
+    state, done, lost = stepper.advance_with_activations(stepper.start([creature.start] * 3), given, dt)
     assert lost.all() and len(state.worlds) == 0 and done == []

@@ -294,8 +294,8 @@ def test_a_failed_step_is_replanned_on_the_device(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The step is replanned, because the thresholds are set to zero, and its result equals that of the host."""
-    monkeypatch.setattr(stepping, "_REPLAN_FACTOR", 0.0)
-    monkeypatch.setattr(stepping, "_REPLAN_MARGIN", -1.0)
+    monkeypatch.setattr(stepping, "REPLAN_FACTOR", 0.0)
+    monkeypatch.setattr(stepping, "REPLAN_MARGIN", -1.0)
     planned: list[bool] = []
     again = DevicePlanner.replan
 

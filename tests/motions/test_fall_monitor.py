@@ -16,7 +16,7 @@ from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AngularMomentumObjective
 from egs_warp.locomotion.rollout import REST_FRAMES, roll_out
 from egs_warp.locomotion.stepper import LocomotionStepper
-from egs_warp.motions.fall_monitor import FALLEN_TILT, FALLEN_TIME, FallMonitor
+from egs_warp.motions.fall_monitor import FALLEN_TILT, FALLEN_TIME, LOST_TIME, FallMonitor
 from egs_warp.motions.follow import Follow
 from egs_warp.motions.get_up import GetUpPhase
 from egs_warp.motions.keyframes import Key, Quantity
@@ -80,6 +80,41 @@ def test_tilt_and_what_a_body_lies_on(creature: CoarseCreature) -> None:
         watch = watched(creature)
         feed_monitor(creature, watch, **given)
         assert watch.fallen == said and watch.is_finished == (said is not None)
+
+
+@pytest.mark.parametrize(
+    ("speeds", "time", "falls"),
+    [
+        # The capture point is v sqrt(h / g) = 0.226 v ahead, and the half width of the base is 0.25 m.
+        ([1.3], 1.1 * LOST_TIME, True),
+        ([1.3], 0.9 * LOST_TIME, False),
+        ([1.0], 5.0, False),
+        ([1.3, 1.0], 1.1 * LOST_TIME, False),
+        ([1.0, -1.3], 1.1 * LOST_TIME, True),
+    ],
+)
+def test_a_body_that_ends_outside_its_support_has_fallen(
+    creature: CoarseCreature, speeds: list[float], time: float, falls: bool
+) -> None:
+    """A fall that has only begun does not end the motion; it is reported if the run ends, unless the body is back over
+    its feet."""
+    watch, body = watched(creature), creature.place.body
+    base = np.flatnonzero(creature.place.standing[:, 2] < 1e-3)
+    contacts = SimpleNamespace(nodes=np.repeat(base[:, None], 4, 1), weights=np.full((len(base), 4), 0.25))
+    contacts.count = len(base)
+    forces = np.tile([body.weight / len(base), 0.0, 0.0], (len(base), 1))
+    report = SimpleNamespace(forces=forces, contacts=contacts, min_gap=0.0)
+    steps, now = round(time * np.sqrt(body.height / 9.81) / DT), 0.0
+    watch.objectives(creature.start, None, DT)
+    for speed in speeds:
+        velocities = np.tile(speed * FORWARD, (len(creature.start.positions), 1))
+        for _ in range(steps):
+            now += DT
+            watch.objectives(replace(creature.start, velocities=velocities, time=now), cast(Any, report), DT)
+    assert watch.fallen is None and not watch.is_finished
+    assert (watch.fall_note is not None) == falls
+    if falls:
+        assert watch.fall_note == f"tipping over, with its capture point outside its feet, at {now:.2f} s"
 
 
 def test_a_fallen_body_has_no_objectives(creature: CoarseCreature) -> None:

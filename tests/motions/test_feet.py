@@ -8,9 +8,12 @@ from typing import cast
 import numpy as np
 import pytest
 
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.fem.body import make_body
+from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import find_feet, foot_of_node, order_counterclockwise, split_base
+from egs_warp.motions.feet import find_feet, foot_of_node, no_slip_feet, order_counterclockwise, split_base
 from egs_warp.motions.footfalls import footfalls
 from tests.support.meshes import block_mesh, figure, stool
 
@@ -95,3 +98,26 @@ def test_slip_is_the_path_of_loaded_contacts_without_swings() -> None:
     nowhere = footfalls(made_trajectory(), FEET, stride=0.0)
     assert (nowhere.slip, nowhere.sole_shift, nowhere.landings) == (0.0, 0.0, fell.landings), "walk 0 ends in a report"
     assert (later.slip, later.sole_shift, later.landings) == (0.0, 0.0, 1)
+
+
+def test_a_foot_may_turn_about_its_centre_of_pressure_but_not_slide() -> None:
+    """The objective of a foot is the sliding velocity at its centre of pressure. Its weight is proportional to the load
+    of a foot that carries less than a tenth of the weight; a foot without load has none."""
+    body = make_body(STOOL, Plane(np.array([0.0, 0.0, 1.0]), 0.0))
+    soles = [foot.sole for foot in FEET]
+    nodes = np.concatenate(soles[:2])
+    shares = np.random.default_rng(3).uniform(0.5, 1.0, len(nodes))
+    own = np.repeat([0, 1], [len(sole) for sole in soles[:2]])
+    loads = shares / np.bincount(own, shares)[own] * np.array([0.6, 0.05])[own]
+    one_node = np.zeros((len(nodes), 4))
+    one_node[:, 0] = 1.0
+    contacts = cast(ContactSet, SimpleNamespace(nodes=np.repeat(nodes[:, None], 4, 1), weights=one_node))
+    contacts.__dict__["nearest_nodes"] = nodes
+    held = no_slip_feet(body, FEET, contacts, loads, np.eye(3)[:2], 100.0)
+    assert [one.weight for one in held] == [pytest.approx(100.0), pytest.approx(50.0)]
+    for index, objective in enumerate(held):
+        mine = own == index
+        pressure = loads[mine] @ STOOL.nodes[nodes[mine]] / loads[mine].sum()
+        turning = np.cross([0.0, 0.0, 1.0], STOOL.nodes - pressure)
+        assert np.allclose(objective.rows @ turning.ravel(), 0.0, atol=1e-12)
+        assert np.allclose(objective.rows @ np.tile([0.3, -0.2, 5.0], len(STOOL.nodes)), [0.3, -0.2])

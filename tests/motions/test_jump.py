@@ -10,7 +10,8 @@ import pytest
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
-from egs_warp.motions.jump import BASE_SWING_WEIGHT, MAX_FOOTHOLD_OFFSET, Jump
+from egs_warp.motions.airborne_soles import BASE_SWING_WEIGHT
+from egs_warp.motions.jump import MAX_FOOTHOLD_OFFSET, Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget, stopping_time
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.twist import TurnHeading

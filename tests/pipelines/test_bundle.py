@@ -17,13 +17,18 @@ from egs_warp.cli import main
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.geometry.gaussians import GaussianCloud, with_degree
+from egs_warp.geometry.main_light import MainLight, irradiance_form, mean_irradiance
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.bundle import BundleBody, read_bundle
 from egs_warp.io.bundle_file import Carrier
+from egs_warp.io.planes import light_from_json
 from egs_warp.kernels.deformation.cage_maps import RIGID
+from egs_warp.lighting.surface_normals import surface_normals
 from egs_warp.pipelines.bundle import export_bundle
 from egs_warp.pipelines.finished_run import FinishedRun
 
+_DIRECTION = np.array([0.48, 0.64, 0.6])
+LIGHT = MainLight(_DIRECTION, 5.0, 0.5, irradiance_form(0.3, 0.0, np.array([0.0, 0.0, 1.0]), 1.0, _DIRECTION))
 READER = Path(__file__).parents[2] / "examples" / "read_bundle.py"
 
 
@@ -113,6 +118,24 @@ def test_the_scene_of_a_run_is_a_static_body(run: FinishedRun, tmp_path: Path) -
     creature, background = read_bundle(tmp_path / "a.egs").bodies
     assert creature.cage is not None and background.cage is None
     assert background.name == "scene" and background.splats.count == scene.count
+
+
+def test_the_light_of_a_run_is_in_the_bundle(
+    run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The file has the light and the normals, to half a step, that the player needs; without a light it has neither."""
+    lit = replace(run, creature=replace(run.creature, light=LIGHT))
+    export_bundle(lit, tmp_path / "a.egs", every=12)
+    assert main(["validate", str(tmp_path / "a.egs")]) == 0
+    bundle = read_bundle(tmp_path / "a.egs")
+    light, normals = light_from_json(bundle.facts["light"]), bundle.bodies[0].normals
+    assert normals is not None
+    assert np.abs(normals - surface_normals(lit.deformer().rest)).max() < 0.51 / 127.0
+    assert mean_irradiance(light) == pytest.approx(1.0)
+    np.testing.assert_allclose(light.irradiance * mean_irradiance(LIGHT), LIGHT.irradiance, atol=1e-12)
+    export_bundle(run, tmp_path / "b.egs", every=12)
+    plain = read_bundle(tmp_path / "b.egs")
+    assert "light" not in plain.facts and plain.bodies[0].normals is None
 
 
 @pytest.mark.parametrize(

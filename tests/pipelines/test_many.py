@@ -14,7 +14,8 @@ import torch
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.gaussians import ARRAYS
-from egs_warp.locomotion.batch import BatchState, BatchStepper
+from egs_warp.locomotion.batch import BatchStepper
+from egs_warp.locomotion.batch_state import BatchState
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.script import motion
@@ -124,7 +125,7 @@ def test_progress_ends_at_the_total(progress_calls: list[tuple[int, int]], outco
 
 @pytest.mark.slow
 def test_worlds_of_a_batch_equal_single_runs(creature: Creature, tmp_path: Path) -> None:
-    """The jobs have two step sizes, three grounds and different lengths; one runs in a worker, and two are invalid. All
+    """The jobs have two step sizes, three grounds and different lengths; one is planned, and two are invalid. All
     trajectories agree with single runs to 1e-9 body heights, in the order of the jobs."""
     count = creature.muscles.segment_count
     held = 0.3 * np.sin(np.arange(6.0)[:, None] + np.arange(count)) * creature.muscles.bounds
@@ -174,11 +175,11 @@ def test_a_batch_too_large_for_a_gpu_is_halved(creature: Creature, monkeypatch: 
     room, asked = 2, []
 
     class Cramped(BatchStepper):
-        def advance(self, state: BatchState, *given: Any) -> Any:
+        def advance_with_activations(self, state: BatchState, *given: Any) -> Any:
             asked.append(len(state.worlds))
             if len(state.worlds) > room:
                 raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate 20.00 MiB")
-            return super().advance(state, *given)
+            return super().advance_with_activations(state, *given)
 
     monkeypatch.setattr("egs_warp.locomotion.batch.BatchStepper", Cramped)
     held = np.zeros((2, creature.muscles.segment_count))

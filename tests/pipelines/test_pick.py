@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import concatenate
@@ -15,9 +16,9 @@ from egs_warp.pipelines.pick import (
     Pick,
     PickHistory,
     PickState,
-    edge_warnings,
     marked,
     on_table_top,
+    photo_warnings,
     pick_warnings,
     proposed,
     resegmented,
@@ -26,7 +27,7 @@ from egs_warp.pipelines.pick import (
 )
 from egs_warp.segmentation.interactive import ClickGraph
 from tests.support.clicking import balls, click, front
-from tests.support.grounds import level
+from tests.support.grounds import level, sheet
 from tests.support.scenes import lying, round_ones, shell
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -77,10 +78,44 @@ def test_labels_are_numbers_of_objects_and_the_active_one_has_precedence():
     assert state.with_new(last.pick).active == 2
 
 
-def test_the_proposal_of_a_scene_is_its_ground_and_the_object_in_the_middle(apart: ClickGraph):
-    pick = proposed(apart, UP, centre=np.array([0.8, 0.0, 0.5]))
+def around(
+    point: tuple[float, float, float], *, count: int = 9, span: float = 360.0, fov: float = 30.0
+) -> list[Camera]:
+    """Return ``count`` cameras in an arc of ``span`` degrees in front of a point, at a distance of 3."""
+    angles = np.radians(-90.0 + span * (np.arange(count) / count - 0.5))
+    eyes = [np.array(point) + 3.0 * np.array([np.cos(angle), np.sin(angle), 0.5]) for angle in angles]
+    return [Camera.look_at(eye, np.array(point), UP, width=80, height=80, vertical_fov_degrees=30.0) for eye in eyes]
+
+
+def test_the_proposal_of_a_scene_is_its_ground_and_the_object_at_which_the_cameras_look(apart: ClickGraph):
+    pick = proposed(apart, UP, cameras=around((0.8, 0.0, 0.5)))
     assert pick.is_guess and abs(pick.plane.offset) < 0.02 and pick.plane.normal[2] > 0.999
-    assert pick.mask[EACH : 2 * EACH].mean() > 0.9 and not pick.mask[:EACH].any()
+    assert pick.mask[EACH : 2 * EACH].mean() > 0.9 and not pick.mask[:EACH].any() and not pick.is_alone
+    assert pick_warnings(apart, pick) == photo_warnings(apart.cloud, pick.mask, around((0.8, 0.0, 0.5))) == ()
+
+
+def test_the_frames_of_the_photos_separate_the_object_from_a_wall_that_it_touches():
+    """Ball and wall have one colour, and no ground links to the wall, which most photos show only in part."""
+    ball = round_ones(shell(), 0.025)
+    wall = level((-3.0, 0.02), (3.0, 1.4), 0.51, 0.05)[:, [0, 2, 1]]
+    floor = level((-3.0, -2.0), (3.0, 0.5), 0.0, 0.05)
+    upright = sheet(wall, np.tile([0.0, -1.0, 0.0], (len(wall), 1)), 0.05, (0.0, 0.0, 0.0))
+    graph = ClickGraph.of(concatenate(ball, upright, lying(floor)))
+    is_ball = np.arange(graph.cloud.count) < ball.count
+    found = proposed(graph, UP, cameras=around((0.0, 0.0, 0.5), span=120.0)).mask
+    assert found[is_ball].mean() > 0.9 and found[~is_ball].mean() < 0.02
+
+
+def test_a_capture_whose_photos_contain_all_of_it_is_one_object_without_its_haze():
+    """The ball is surrounded by faint wide Gaussians, as in a short training on photos with a white background."""
+    ball, haze = round_ones(shell(), 0.025), round_ones(1.6 * shell(60), 0.3)
+    faint = replace(haze, opacity_logits=wp.full(haze.count, -4.0, dtype=wp.float32))
+    faint.sh.fill_(1.5)
+    graph = ClickGraph.of(concatenate(ball, faint))
+    cameras = around((0.0, 0.0, 0.5))
+    pick = proposed(graph, UP, cameras=cameras)
+    assert pick.is_alone and pick.mask[:EACH].mean() > 0.95 and pick.mask[EACH:].mean() < 0.15
+    assert pick_warnings(graph, pick) == photo_warnings(graph.cloud, pick.mask, cameras) == ()
 
 
 def test_a_capture_of_one_object_is_proposed_whole():
@@ -144,7 +179,13 @@ def test_surroundings_that_came_along_are_reported(apart: ClickGraph):
         np.array([0.0, -1.5, 2.5]), np.zeros(3), UP, width=400, height=300, vertical_fov_degrees=50.0
     )
     ball = np.arange(apart.cloud.count) < EACH
-    assert edge_warnings(apart.cloud, ball, [front()]) == () == edge_warnings(apart.cloud, ball, [])
-    (line,) = edge_warnings(apart.cloud, np.ones(apart.cloud.count, bool), [front(), close])
+    assert photo_warnings(apart.cloud, ball, [front()]) == () == photo_warnings(apart.cloud, ball, [])
+    (line,) = photo_warnings(apart.cloud, np.ones(apart.cloud.count, bool), [front(), close])
     assert line.startswith("it touches the picture's edges all round in ") and " of 2 photos, " in line
     assert line.endswith("; remove what does not belong to it")
+
+
+def test_a_fragment_is_reported(apart: ClickGraph):
+    fragment = (np.arange(apart.cloud.count) < EACH) & (apart.means[:, 2] > 0.97)
+    (line,) = photo_warnings(apart.cloud, fragment, [front()])
+    assert line.endswith("% of the photos; if it is only a part, click on the rest")

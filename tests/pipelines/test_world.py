@@ -38,6 +38,9 @@ def test_a_moved_body_keeps_its_place_in_the_capture() -> None:
     np.testing.assert_allclose(*places, atol=1e-12)
     np.testing.assert_allclose(moved.front.direction @ creature.front.direction, 0.0, atol=1e-12)
     assert moved.body is creature.body and moved.shape is creature.shape
+    slippery = moved.with_friction(0.3)
+    assert slippery.geometry.friction == 0.3
+    np.testing.assert_allclose(slippery.start.positions, moved.start.positions, atol=0.01)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from egs_warp.segmentation.graph_cut import SplatGraph
+from tests.support.scenes import round_ones
 
 
 def cost(graph: SplatGraph, inside: np.ndarray, leaning: np.ndarray, smoothness: float) -> float:
@@ -81,3 +82,18 @@ def test_hardly_any(count: int) -> None:
     graph = SplatGraph.linking(np.zeros((count, 3)), np.zeros((count, 3)))
     held = np.arange(count) == 0
     np.testing.assert_array_equal(graph.cut(-np.ones(count), held, np.zeros(count, bool), smoothness=0.0), held)
+
+
+def test_gaussians_at_one_place_do_not_isolate_it() -> None:
+    """A line of places with eight coincident Gaussians each, as training stacks them, remains connected. The ten
+    nearest neighbours of a Gaussian alone connect hardly more than its own place."""
+    line = np.zeros((400, 3))
+    line[:, 0] = np.repeat(np.arange(50), 8) + np.tile(0.001 * np.arange(8), 50)
+    everywhere = np.arange(400)
+    stacked = round_ones(line, 1.0)
+    by_place, by_point = SplatGraph.of(stacked, everywhere, neighbours=6), SplatGraph.linking(line, line, neighbours=6)
+    assert len(np.unique(by_place.parts(np.ones(400, bool)))) == 1
+    assert len(np.unique(by_point.parts(np.ones(400, bool)))) == 50
+    held, dropped = everywhere < 8, everywhere >= 392
+    inside = by_place.cut(np.where(line[:, 0] < 20.5, 0.2, -0.2), held, dropped)
+    np.testing.assert_array_equal(inside, line[:, 0] < 20.5)

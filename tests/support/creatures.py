@@ -37,6 +37,18 @@ def sagging(creature: Creature) -> Creature:
     return replace(creature, stepper=stepper, start=settle(stepper))
 
 
+def on_its_rim(geometry: ContactGeometry, count: int = 12) -> ContactGeometry:
+    """Return the geometry with only ``count`` contact points of the base, the outermost in all directions."""
+    corners = geometry.mesh.nodes[geometry.mesh.tets[geometry.tet_from_point]]
+    places = np.einsum("pw,pwi->pi", geometry.weights, corners)
+    heights = geometry.ground_heights(places)
+    base = np.flatnonzero(heights < 0.01)
+    angles = 2.0 * np.pi * np.arange(count) / count
+    reach = (places[base, :2] - places[base, :2].mean(axis=0)) @ np.stack([np.cos(angles), np.sin(angles)])
+    chosen = np.unique(base[np.argmax(reach, axis=0)])
+    return replace(geometry, tet_from_point=geometry.tet_from_point[chosen], weights=geometry.weights[chosen])
+
+
 @dataclass(frozen=True)
 class CoarseCreature:
     """A stepper, the stance of its body, and the state of the body in this stance."""

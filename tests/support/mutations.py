@@ -368,8 +368,13 @@ OTHER_FORMULAS: list[Mutation] = [
         ),
         (
             *("audit: the torque of contact", "locomotion/audit.py"),
-            *("np.cross(_start_points(t) - com[t.contact_step]", "np.cross(_start_points(t)"),
+            *("np.cross(start_points(t) - com[t.contact_step]", "np.cross(start_points(t)"),
             "locomotion/test_audit.py::test_a_run_that_slides_passes",
+        ),
+        (
+            *("world audit: the slip relative to the other body", "locomotion/world_audit.py"),
+            *("contact_displacements(t)[1][i] - contact_displacements(u)[1][j]", "contact_displacements(t)[1][i]"),
+            "locomotion/test_world_audit.py::test_a_correct_run_passes",
         ),
         (
             *("uneven ground: the distance from its tangent plane", "kernels/contact/height_field.py"),

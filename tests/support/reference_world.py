@@ -98,18 +98,3 @@ class ReferenceWorld:
         self.states = [
             BodyState(p.end_positions(v), v, p.state.time + dt) for p, v in zip(problems, velocities, strict=True)
         ]
-
-    def momenta(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the linear and the angular momentum (3,) of the world, about the origin."""
-        pairs = list(zip(self.bodies, self.states, strict=True))
-        linear = sum(body.node_mass @ state.velocities for body, state in pairs)
-        angular = sum(
-            (np.cross(state.positions, state.velocities) * body.node_mass[:, None]).sum(axis=0) for body, state in pairs
-        )
-        return np.asarray(linear), np.asarray(angular)
-
-    def depth(self) -> float:
-        """Return the depth (m) of the deepest contact point in another body."""
-        positions = np.concatenate([state.positions for state in self.states])
-        pairs = self.detector.body_pairs(positions)
-        return max((-float(self.detector.gaps(a, b, positions).min()) for a, b in pairs), default=0.0)

@@ -6,15 +6,19 @@ import base64
 import io
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.main_light import MainLight, irradiance_form
 from egs_warp.io.bundle import read_bundle
+from egs_warp.lighting.relighting import Relighter
 from egs_warp.pipelines.bundle import export_bundle
 from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.render.rasteriser import render_gaussians
@@ -111,6 +115,52 @@ def _psnr_on_body(ours: np.ndarray, theirs: np.ndarray) -> float:
     body = np.abs(ours - ours[0, 0]).max(axis=-1) > 0.02
     assert 0.02 < body.mean() < 0.9
     return float(-10.0 * np.log10(((ours - theirs)[body] ** 2).mean()))
+
+
+def test_the_main_light_casts_the_shadow_and_relights_the_turned_body(
+    chromium: Any, site: str, folder: Path, run: FinishedRun
+) -> None:
+    """A rotated body has the colours of the film, and the floor is darker on the side away from the light."""
+    direction = np.array([0.48, 0.64, 0.6])
+    light = MainLight(direction, 5.0, 0.5, irradiance_form(0.3, 0.0, np.array([0.0, 0.0, 1.0]), 1.0, direction))
+    t = run.trajectory
+    turned = t.positions @ Rotation.from_euler("z", 150.0, degrees=True).as_matrix().T
+    lit = replace(run, trajectory=replace(t, positions=turned), creature=replace(run.creature, light=light))
+    export_bundle(lit, folder / "lit.egs", every=12)
+    page, complaints = _open(chromium, site, folder, _element(f'src="lit.egs" background="{_BACKGROUND}"'))
+    _wait_until_ready(page)
+    picture, camera = _picture(page), _camera(page)
+    deformed = run.deformer().deform(turned[run.steps[0]])
+    relit = Relighter(run.creature.splats, light).relight(deformed.cloud, deformed.rotations)
+    red, green, blue = (int(_BACKGROUND[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
+    ours, captured = (
+        np.clip(render_gaussians(cloud, camera, background=(red, green, blue)).colour.numpy(), 0.0, 1.0)
+        for cloud in (relit, deformed.cloud)
+    )
+    assert _psnr_on_body(ours, picture) >= 38.0 > 10.0 + _psnr_on_body(captured, picture)
+    page.evaluate("document.querySelector('egs-player').removeAttribute('background')")
+    centre = turned[run.steps[0]].mean(axis=0)
+    page.evaluate(
+        """(centre) => {
+            const { view } = document.querySelector("egs-player");
+            view.camera.position.set(centre[0], centre[1] + 0.01, 5 * view.height);
+            view.controls.target.set(centre[0], centre[1], 0);
+            view.controls.update();
+            view.creature.object.visible = false;
+        }""",
+        centre.tolist(),
+    )
+    camera, floor = _camera(page), _picture(page).mean(axis=-1)
+    foot = centre - centre[2] / direction[2] * direction
+    levels = []
+    for point in (foot, 2.0 * centre * [1.0, 1.0, 0.0] - foot):
+        x, y, z = camera.rotation @ (point - camera.centre)
+        column, row = round(camera.cx + camera.fx * x / z), round(camera.cy + camera.fy * y / z)
+        levels.append(floor[row - 3 : row + 4, column - 3 : column + 4].mean())
+    shadow, opposite = levels
+    assert shadow < 0.75 * opposite
+    assert complaints == []
+    page.close()
 
 
 def test_picture_is_like_our_own_picture_of_the_same_frame(

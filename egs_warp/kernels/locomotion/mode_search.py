@@ -333,32 +333,18 @@ def unpack_program(packed: wp.array[real]):
     return program
 
 
-@wp.kernel(launch_bounds=BLOCK)
-def mode_search_kernel(
-    # In:
+@wp.func
+def search(
     packed: wp.array[real],
     restart_cost: real,
-    # Scratch:
     workspace: Workspace,
     rows: UnitConstraints,
     state: ActiveSet,
     splitting: Splitting,
-    # Out:
     answer: wp.array[real],
     settled_out: wp.array[int],
 ):
-    """Run ``contact_modes.search_modes`` on packed input.
-
-    Args:
-        packed: m, n, friction, constant, maximum number of QPs, and padding up to ``HEADER_SIZE``; then P, q, rows,
-            offset, lower and upper bounds of the activations; then the activations (m,), contact modes (n,) and slip
-            directions (n, 2) at the start of the search.
-        restart_cost: objective below which no restart is needed.
-        workspace, rows, state, splitting: scratch memory.
-        answer: status, number of QPs, number of infeasible QPs, objective, 1 if a point was found; from ``HEADER_SIZE``
-            on, the point (m + 3n,).
-        settled_out: (1,) set to 1 once a point with an objective below ``restart_cost`` is found.
-    """
+    """Run ``contact_modes.search_modes`` in one world; arguments as for ``mode_search_kernel``."""
     lane = lane_of_block()
     program = unpack_program(packed)
     m = program.m
@@ -431,3 +417,68 @@ def mode_search_kernel(
         answer[2] = real(infeasible)
         answer[3] = best
         answer[4] = real(has_point)
+
+
+@wp.kernel(launch_bounds=BLOCK)
+def mode_search_kernel(
+    # In:
+    packed: wp.array[real],
+    restart_cost: real,
+    # Scratch:
+    workspace: Workspace,
+    rows: UnitConstraints,
+    state: ActiveSet,
+    splitting: Splitting,
+    # Out:
+    answer: wp.array[real],
+    settled_out: wp.array[int],
+):
+    """Run ``contact_modes.search_modes`` on packed input.
+
+    Args:
+        packed: m, n, friction, constant, maximum number of QPs, and padding up to ``HEADER_SIZE``; then P, q, rows,
+            offset, lower and upper bounds of the activations; then the activations (m,), contact modes (n,) and slip
+            directions (n, 2) at the start of the search.
+        restart_cost: objective below which no restart is needed.
+        workspace, rows, state, splitting: scratch memory.
+        answer: status, number of QPs, number of infeasible QPs, objective, 1 if a point was found; from ``HEADER_SIZE``
+            on, the point (m + 3n,).
+        settled_out: (1,) set to 1 once a point with an objective below ``restart_cost`` is found.
+    """
+    search(packed, restart_cost, workspace, rows, state, splitting, answer, settled_out)
+
+
+@wp.kernel(launch_bounds=BLOCK)
+def mode_search_of_worlds_kernel(
+    # In:
+    packed: wp.array2d[real],
+    # Scratch:
+    workspaces: wp.array[Workspace],
+    rows: wp.array[UnitConstraints],
+    states: wp.array[ActiveSet],
+    splittings: wp.array[Splitting],
+    # Out:
+    answers: wp.array2d[real],
+    settled_out: wp.array2d[int],
+):
+    """Run the search of ``mode_search_kernel`` in each world, with one block for each.
+
+    Launch with (B, threads of a block) threads.
+
+    Args:
+        packed: (B, ...) packed input of each world.
+        workspaces, rows, states, splittings: (B,) scratch memory of each world.
+        answers: (B, ...) result of each world.
+        settled_out: (B, 1) not used.
+    """
+    world, _ = wp.tid()
+    search(
+        packed[world],
+        real(-wp.inf),
+        workspaces[world],
+        rows[world],
+        states[world],
+        splittings[world],
+        answers[world],
+        settled_out[world],
+    )

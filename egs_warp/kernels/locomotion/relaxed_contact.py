@@ -219,25 +219,16 @@ def objective_at(program: Program, relaxed: Relaxed, shift: real):
     return total + program.constant
 
 
-@wp.kernel(launch_bounds=BLOCK)
-def relaxed_qp_kernel(
-    # In:
+@wp.func
+def relax(
     packed: wp.array[real],
-    # Scratch:
     relaxed: Relaxed,
     rows: UnitConstraints,
     state: ActiveSet,
     splitting: Splitting,
-    # Out:
     answer: wp.array[real],
 ):
-    """Run ``contact_modes.solve_relaxed`` on packed input.
-
-    Args:
-        packed: packed input of ``mode_search_kernel``.
-        relaxed, rows, state, splitting: scratch memory.
-        answer: status and objective; from ``HEADER_SIZE`` on, the activations (m,).
-    """
+    """Run ``contact_modes.solve_relaxed`` in one world; arguments as for ``relaxed_qp_kernel``."""
     lane = lane_of_block()
     program = unpack_program(packed)
     size = program.size
@@ -273,33 +264,83 @@ def relaxed_qp_kernel(
         answer[0] = real(ended)
 
 
+@wp.kernel(launch_bounds=BLOCK)
+def relaxed_qp_kernel(
+    # In:
+    packed: wp.array[real],
+    # Scratch:
+    relaxed: Relaxed,
+    rows: UnitConstraints,
+    state: ActiveSet,
+    splitting: Splitting,
+    # Out:
+    answer: wp.array[real],
+):
+    """Run ``contact_modes.solve_relaxed`` on packed input.
+
+    Args:
+        packed: packed input of ``mode_search_kernel``.
+        relaxed, rows, state, splitting: scratch memory.
+        answer: status and objective; from ``HEADER_SIZE`` on, the activations (m,).
+    """
+    relax(packed, relaxed, rows, state, splitting, answer)
+
+
+@wp.kernel(launch_bounds=BLOCK)
+def relaxed_qp_of_worlds_kernel(
+    # In:
+    packed: wp.array2d[real],
+    # Scratch:
+    relaxed: wp.array[Relaxed],
+    rows: wp.array[UnitConstraints],
+    states: wp.array[ActiveSet],
+    splittings: wp.array[Splitting],
+    # Out:
+    answers: wp.array2d[real],
+):
+    """Run the solve of ``relaxed_qp_kernel`` in each world, with one block for each.
+
+    Launch with (B, threads of a block) threads.
+
+    Args:
+        packed: (B, ...) packed input of each world.
+        relaxed, rows, states, splittings: (B,) scratch memory of each world.
+        answers: (B, ...) result of each world.
+    """
+    world, _ = wp.tid()
+    relax(packed[world], relaxed[world], rows[world], states[world], splittings[world], answers[world])
+
+
 @wp.kernel
 def pack_search_kernel(
     # Model:
     weight: real,
     # In:
-    activations: wp.array[real],
-    forces: wp.array[Vec3],
+    activations: wp.array2d[real],
+    forces: wp.array2d[Vec3],
     is_settled: wp.array[int],
     # Out:
-    packed_out: wp.array[real],
+    packed_out: wp.array2d[real],
 ):
-    """Replace the start of a packed search, or disable the search if ``is_settled``. Launch with m + K threads.
+    """Replace the start of a packed search in each world, or disable the search if ``is_settled``.
+
+    Launch with (B, m + K) threads.
 
     Args:
         weight: body weight, N.
-        activations: (m,) activations at the new start.
-        forces: (K,) N, contact forces for these activations.
-        is_settled: (1,) nonzero to set the maximum number of QPs to 0.
-        packed_out: packed input of ``mode_search_kernel``.
+        activations: (B, m) activations at the new start.
+        forces: (B, K) N, contact forces for these activations.
+        is_settled: (B,) nonzero to set the maximum number of QPs to 0.
+        packed_out: (B, ...) packed input of ``mode_search_kernel``.
     """
-    k = wp.tid()
-    if k == 0 and is_settled[0] != 0:
-        packed_out[4] = real(0.0)
-    program = unpack_program(packed_out)
+    world, k = wp.tid()
+    packed = packed_out[world]
+    if k == 0 and is_settled[world] != 0:
+        packed[4] = real(0.0)
+    program = unpack_program(packed)
     begin = program.upper + program.m
     kinds = begin + program.m
     if k < program.m:
-        packed_out[begin + k] = activations[k]
+        packed[begin + k] = activations[world, k]
     if k < program.n:
-        assemble_contact(packed_out, kinds, kinds + program.n, k, forces[k] / weight, program.friction)
+        assemble_contact(packed, kinds, kinds + program.n, k, forces[world, k] / weight, program.friction)

@@ -50,96 +50,98 @@ def assemble_qp_kernel(
     # In:
     counts: wp.array[int],
     frictions: wp.array[real],
-    form: wp.array2d[real],
-    speeds: wp.array2d[real],
-    shifts: wp.array[real],
-    bounds: wp.array2d[real],
-    forces: wp.array[Vec3],
+    form: wp.array3d[real],
+    speeds: wp.array3d[real],
+    shifts: wp.array2d[real],
+    bounds: wp.array3d[real],
+    forces: wp.array2d[Vec3],
     # Out:
-    packed_out: wp.array[real],
+    packed_out: wp.array2d[real],
 ):
-    """Pack the QP of m activations and n contacts; buffers have a capacity of K contacts.
+    """Pack the QP of each world, with m activations and n contacts; buffers have a capacity of K contacts.
 
-    Launch with (m + 6K + 1, m + 3K + 1) threads.
+    Launch with (B, m + 6K + 1, m + 3K + 1) threads.
 
     Args:
         limit: maximum number of QPs that the search may solve.
         speed: sqrt(g H), m/s, the unit of velocity.
         weight: body weight, N, the unit of force.
-        counts: (1,) number of contacts n.
-        frictions: (1,) Coulomb coefficient.
-        form: (m + 3K + 1, m + 3K + 1) quadratic form of the cost.
-        speeds: (3K, m + 3K + 1) m/s, contact velocities as affine functions.
-        shifts: (K,) m/s, normal bias of each contact.
-        bounds: (3, m) lower bounds, upper bounds and start of the activations.
-        forces: (K,) N, contact forces at the start.
-        packed_out: packed search input.
+        counts: (B,) number of contacts n.
+        frictions: (B,) Coulomb coefficient.
+        form: (B, m + 3K + 1, m + 3K + 1) quadratic form of the cost.
+        speeds: (B, 3K, m + 3K + 1) m/s, contact velocities as affine functions.
+        shifts: (B, K) m/s, normal bias of each contact.
+        bounds: (B, 3, m) lower bounds, upper bounds and start of the activations.
+        forces: (B, K) N, contact forces at the start.
+        packed_out: (B, ...) packed search input.
     """
-    row, column = wp.tid()
-    m = bounds.shape[1]
-    n = counts[0]
+    world, row, column = wp.tid()
+    m = bounds.shape[2]
+    n = counts[world]
     size = m + 3 * n
-    last = form.shape[0] - 1
+    last = form.shape[1] - 1
     q = _HEADER + size * size
     rows = q + size
     offset = rows + 3 * n * size
     if row < last:
         if row < size:
             if column < size:
-                packed_out[_HEADER + row * size + column] = form[row, column]
+                packed_out[world, _HEADER + row * size + column] = form[world, row, column]
             elif column == last:
-                packed_out[q + row] = form[row, last]
-    elif row < last + speeds.shape[0]:
+                packed_out[world, q + row] = form[world, row, last]
+    elif row < last + speeds.shape[1]:
         k = row - last
         if k < 3 * n:
             if column < size:
-                packed_out[rows + k * size + column] = speeds[k, column] / speed
+                packed_out[world, rows + k * size + column] = speeds[world, k, column] / speed
             elif column == last:
-                packed_out[offset + k] = speeds[k, last] / speed
+                packed_out[world, offset + k] = speeds[world, k, last] / speed
                 if k % 3 == 0:
-                    packed_out[offset + k] = (speeds[k, last] + shifts[k / 3]) / speed
+                    packed_out[world, offset + k] = (speeds[world, k, last] + shifts[world, k / 3]) / speed
     else:
         begin = offset + 3 * n
         for part in range(3):
             if column < m:
-                packed_out[begin + part * m + column] = bounds[part, column]
+                packed_out[world, begin + part * m + column] = bounds[world, part, column]
         kinds = begin + 3 * m
         if column < n:
-            assemble_contact(packed_out, kinds, kinds + n, column, forces[column] / weight, frictions[0])
+            force = forces[world, column] / weight
+            assemble_contact(packed_out[world], kinds, kinds + n, column, force, frictions[world])
         if column == last:
-            packed_out[0] = real(m)
-            packed_out[1] = real(n)
-            packed_out[2] = frictions[0]
-            packed_out[3] = real(0.5) * form[last, last]
-            packed_out[4] = real(limit)
+            packed_out[world, 0] = real(m)
+            packed_out[world, 1] = real(n)
+            packed_out[world, 2] = frictions[world]
+            packed_out[world, 3] = real(0.5) * form[world, last, last]
+            packed_out[world, 4] = real(limit)
 
 
 @wp.kernel
 def scatter_solution_kernel(
     # In:
     counts: wp.array[int],
-    answer: wp.array[real],
+    answer: wp.array2d[real],
     m: int,
     # Out:
-    x_out: wp.array[real],
+    x_out: wp.array2d[real],
 ):
-    """Expand the point of the search result to the contact capacity K.
+    """Expand the point of the search result of each world to the contact capacity K. Launch with (B, m + 3K + 1)
+    threads.
 
     Args:
-        counts: (1,) number of contacts n.
-        answer: packed search result.
+        counts: (B,) number of contacts n.
+        answer: (B, ...) packed search result.
         m: number of activations.
-        x_out: (m + 3K + 1,) the point, with zeros for unused contacts and 1 as the last entry.
+        x_out: (B, m + 3K + 1) the point, with zeros for unused contacts and 1 as the last entry.
     """
-    k = wp.tid()
-    size = m + 3 * counts[0]
-    last = x_out.shape[0] - 1
+    world, k = wp.tid()
+    size = m + 3 * counts[world]
+    last = x_out.shape[1] - 1
     value = real(0.0)
     if k < size:
-        value = answer[_HEADER + k]
+        value = answer[world, _HEADER + k]
     elif k == last:
         value = real(1.0)
-    x_out[k] = value
+    x_out[world, k] = value
 
 
 @wp.kernel

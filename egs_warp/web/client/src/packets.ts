@@ -30,8 +30,7 @@ export interface Facts {
   max_stretch: number;
   /** True if the capture was trained with antialiasing. */
   antialiased: boolean;
-  /** Main light of the capture: direction to the light, fraction of the ground's brightness that its shadow removes,
-   * and quadratic form of the irradiance (sixteen numbers). */
+  /** Main light of the capture. */
   light?: MainLight;
   /** True for the still capture that is shown while its creature is prepared. */
   preparing?: boolean;
@@ -45,9 +44,12 @@ export interface Facts {
 }
 
 export interface MainLight {
+  /** Unit vector to the light. */
   direction: [number, number, number];
+  /** Fraction of the displayed brightness of the ground that the shadow removes. */
   shade: number;
-  irradiance: number[];
+  /** Quadratic form of the irradiance, four rows of four numbers. */
+  irradiance: number[][];
 }
 
 /** Style of a jump; each value multiplies a default value (egs_warp/motions/style.py). */

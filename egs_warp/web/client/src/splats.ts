@@ -45,8 +45,8 @@ export interface DeformedSplats {
 
 /** Change of the colours as the splats rotate in the main light. */
 export interface Relighting {
-  /** Quadratic form of the irradiance, sixteen numbers. */
-  irradiance: number[];
+  /** Quadratic form of the irradiance, four rows of four numbers. */
+  irradiance: number[][];
   /** Normal of each splat at rest as bytes 128 + 127 n. */
   normals: Uint8Array;
 }
@@ -106,7 +106,7 @@ export function deformedSplats(
     normals: dyno.dynoSampler2D(relighting ? normalTexture(relighting.normals) : cage, "egsNormals"),
     // The irradiance is zero without a main light.
     irradiance: dyno.dynoMat4(
-      new THREE.Matrix4().fromArray(relighting?.irradiance ?? new Array<number>(16).fill(0)),
+      new THREE.Matrix4().fromArray(relighting?.irradiance.flat() ?? new Array<number>(16).fill(0)),
       "egsIrradiance",
     ),
     degree: dyno.dynoConst("int", degree),

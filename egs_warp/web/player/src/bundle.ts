@@ -1,5 +1,6 @@
 // Reader of bundles (docs/concepts/bundle.md) that reads the data as they arrive.
 
+import type { MainLight } from "../../client/src/packets";
 import type { Embedding, SplatData } from "../../client/src/splats";
 
 export interface Camera {
@@ -20,6 +21,8 @@ export interface Facts {
   height?: number;
   flat_ground?: boolean;
   camera?: Camera;
+  /** Main light of the capture, in the axes of the bundle. */
+  light?: MainLight;
 }
 
 export interface BundleCage {
@@ -36,6 +39,8 @@ export interface BundleBody {
   name: string;
   antialiased: boolean;
   splats: SplatData;
+  /** Normals of the splats at rest, as bytes 128 + 127 n. */
+  normals?: Uint8Array | undefined;
   /** Cage that moves the splats; undefined for static splats. */
   cage?: BundleCage;
 }
@@ -108,8 +113,9 @@ export async function readBundle(stream: ReadableStream<Uint8Array>): Promise<Bu
   const read = async (entries: Entries): Promise<Arrays> => {
     const arrays: Arrays = new Map();
     for (const [name, entry] of byOffset(entries)) {
-      // The shader reads the bands in their stored form.
-      arrays.set(name, await numbersOf(source, name === "bands" ? { ...entry, step: undefined } : entry));
+      // The shader reads bands and normals in their stored form.
+      const isStored = name === "bands" || name === "normals";
+      arrays.set(name, await numbersOf(source, isStored ? { ...entry, step: undefined } : entry));
     }
     return arrays;
   };
@@ -235,7 +241,8 @@ function bodyOf(text: BodyText, arrays: Arrays): BundleBody {
     embedding: embeddingOf(arrays, splats, text.max_stretch ?? 1),
     frames: [],
   };
-  return { name, antialiased, splats, cage };
+  const normals = arrays.get("normals");
+  return { name, antialiased, splats, cage, normals: normals instanceof Uint8Array ? normals : undefined };
 }
 
 function embeddingOf(arrays: Arrays, { scales }: SplatData, maxStretch: number): Embedding {

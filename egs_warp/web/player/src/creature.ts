@@ -17,7 +17,10 @@ export class Creature {
   ) {
     const { facts } = bundle;
     const trackOf = (cage: BundleCage) => ({ ...cage, positionsAt: (frame: number) => cage.frames[frame]! });
-    const bodies = bundle.bodies.map(({ splats, cage }) => ({ splats, track: cage && trackOf(cage) }));
+    const bodies = bundle.bodies.map(({ splats, cage, normals }) => {
+      const relighting = facts.light && normals && { irradiance: facts.light.irradiance, normals };
+      return { splats, track: cage && trackOf(cage), relighting };
+    });
     this.bodies = new Bodies(bodies, { shadow });
     this.object = this.bodies.object;
     this.object.name = facts.title ?? "creature";

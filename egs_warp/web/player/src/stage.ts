@@ -31,10 +31,11 @@ export class BundleStage extends Stage {
       height: (facts.height ?? 1) * facts.metres_per_unit,
       surface: surfaceOf(bundle),
       nodeCount,
+      // The ground and its shadow are in the axes of the bundle.
+      light: facts.light,
     });
     this.creature = new Creature(bundle, { up: UP, shadow: this.ground.shadow });
     this.bodies = this.creature.bodies;
-    // The ground and its shadow are in the axes of the bundle.
     const isInPlace = new THREE.Matrix4().equals(this.placement());
     this.isFlat = isInPlace && facts.flat_ground === true;
     this.groundHeight = this.isFlat ? 0 : this.lowest();
