@@ -1,4 +1,4 @@
-"""How the threads of PyTorch wait for each other."""
+"""Waiting policy of the threads of PyTorch."""
 
 from __future__ import annotations
 
