@@ -1,6 +1,7 @@
-"""Accuracy of the remaining time in the progress bars of a segmentation and of simulations.
+"""Accuracy of the remaining time in the progress bars of scenes and of simulations.
 
-The built-in pawn is segmented from its scene, and jumps, hops, twists and walks. At each update of the bar, the
+The built-in pawn, and koala and fox if they are in the folder of data, are separated from their scenes. The pawn jumps,
+hops, twists and walks. At each update of the bar, the
 displayed remaining time is compared with the true remaining time, if that is at least 5 s, because the bar shows whole
 seconds.
 
@@ -20,18 +21,21 @@ import numpy as np
 
 from egs_warp.assets import pawn, scene
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io.capture import read_capture
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import Creature, make_creature
 from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
 from egs_warp.pipelines.progress import scene_bar, simulation_bar
 from egs_warp.pipelines.simulated_run import simulate
 from egs_warp.segmentation.object_spec import ObjectSpec
-from harness import Row, Table, flags, report
+from harness import Row, Table, data_folder, flags, report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCRIPTS = ("jump", "hop x2", "twist", "walk 0.2")
+CAPTURES = {"koala.ply": ((0.1, -0.7, 0.15), "-y"), "fox.ply": ((0.0, 0.0, 2.0), "z")}
+"""Point on the object, and up direction, of each captured scene in the folder of data."""
 MIN_REMAINING = 5.0
 """Minimum true remaining time of a comparison, s."""
 
@@ -74,18 +78,19 @@ def simulated(creature: Creature, script: str, file: TextIO) -> int:
         return len(simulate(creature, motion(script), progress=progress).frames) - 1
 
 
-def segmented(scene_cloud: GaussianCloud, file: TextIO) -> int:
-    """Segment the pawn of a scene from a click."""
+def segmented(scene_cloud: GaussianCloud, point: Sequence[float], up: str, file: TextIO) -> int:
+    """Prepare the object at a ``point`` (3,) of a scene."""
     options = SceneOptions()
-    with scene_bar(options.stages, file=file) as progress:
-        prepare_scene(scene_cloud, ObjectSpec(point=np.array([0.0, 0.0, 0.5])), options=options, progress=progress)
+    spec = ObjectSpec(point=np.array(point))
+    with scene_bar(options.costs(scene_cloud.count), file=file) as bar:
+        prepare_scene(scene_cloud, spec, up=up, options=options, progress=bar.update, expect_costs=bar.expect)
     return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
     parser = flags(
-        __doc__, quick="only the scene, the jump and the walk", device="cpu", seed="not used: nothing here is random"
+        __doc__, quick="only the scenes, the jump and the walk", device="cpu", seed="not used: nothing here is random"
     )
     options = parser.parse_args(arguments)
     built = pawn(device=options.device)
@@ -96,7 +101,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         run="<10", frames="6d", seconds="7.0f", updates="5d", min=".2f", median=".2f", max=".2f", within=".0%"
     )
     scene_cloud = scene("pawn", device=options.device).whole()[0]
-    runs = {"scene": partial(segmented, scene_cloud)}
+    runs = {"scene": partial(segmented, scene_cloud, (0.0, 0.0, 0.5), "z")}
+    for file, (point, up) in CAPTURES.items():
+        path = data_folder() / "scenes" / file
+        if path.is_file():
+            runs[path.stem] = partial(segmented, read_capture(path, device=options.device), point, up)
     runs |= {script: partial(simulated, creature, script) for script in (SCRIPTS[::3] if options.quick else SCRIPTS)}
     rows = []
     for name, run in runs.items():

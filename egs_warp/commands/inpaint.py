@@ -84,8 +84,8 @@ def _inpaint(args: argparse.Namespace) -> int:
     hole = _hole(args, plane, recorded, background)
     assert hole is not None, "the flags define a hole"
     with named_files(args.out, picture, overwrite=args.overwrite) as files:
-        with scene_bar({"inpaint": options.steps > 0}) as show_progress:
-            painted = lambda done: show_progress("inpaint", done)  # noqa: E731
+        with scene_bar({"inpaint": 1.0}) as bar:
+            painted = lambda done: bar.update("inpaint", done)  # noqa: E731
             result = inpaint(background.cloud, hole, inpainter=inpainter, options=options, progress=painted)
         compared = before_and_after(result)
         files.begin()

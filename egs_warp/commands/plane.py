@@ -52,8 +52,8 @@ def _plane(args: argparse.Namespace) -> int:
     check_run_folder(args.out, overwrite=args.overwrite, writes=_writes(args))
     scene = read_scene(args)
     with run_folder(args.out, command="plane", overwrite=args.overwrite) as run:
-        with scene_bar({"plane": True}) as show_progress:
-            show_progress("plane", 0.0)
+        with scene_bar({"plane": 1.0}) as bar:
+            bar.update("plane")
             result = planes_of_scene(scene, plane_mask=args.plane_mask, view=args.view, count=args.count)
         for note in (*scene.notes, *result.notes):
             print_note(note)

@@ -90,10 +90,10 @@ class SceneInput:
         if scene is not None:
             print_note(f"reading the prepared scene from {cache_folder()}")
             return scene
-        with scene_bar(options.stages) as show_progress:
+        with scene_bar(options.costs(self.cloud.count)) as bar:
 
             def progress(stage: str, done: float) -> None:
-                show_progress(stage, done)
+                bar.update(stage, done)
                 if done == 0.0:
                     begin_stage(stage)
 
@@ -106,6 +106,7 @@ class SceneInput:
                 plane=self.plane,
                 options=options,
                 progress=progress,
+                expect_costs=bar.expect,
             )
         note = write_scene(key, scene)
         if note is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,7 +25,13 @@ class Inpainter(Protocol):
     """An algorithm that fills a hole in a face-on picture of a plane."""
 
     def fill(
-        self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
+        self,
+        image: np.ndarray,
+        hole: np.ndarray,
+        known: np.ndarray,
+        shade: np.ndarray | None = None,
+        *,
+        progress: Callable[[float], None] = lambda done: None,
     ) -> np.ndarray:
         """Fill the hole and return the picture.
 
@@ -33,6 +40,7 @@ class Inpainter(Protocol):
             hole: (H, W) bool, the pixels to fill.
             known: (H, W) bool, where ``image`` can be trusted outside the hole.
             shade: (H, W) bool, shaded pixels that should not be copied to lit places.
+            progress: Called with the finished fraction, if the method consists of several parts.
 
         Returns:
             (H, W, 3) float32, 0 to 1, equal to ``image`` outside ``hole``.
@@ -58,7 +66,13 @@ class OpenCvInpainter:
     """Radius of the neighbourhood of each pixel, in pixels."""
 
     def fill(
-        self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
+        self,
+        image: np.ndarray,
+        hole: np.ndarray,
+        known: np.ndarray,
+        shade: np.ndarray | None = None,
+        *,
+        progress: Callable[[float], None] = lambda done: None,
     ) -> np.ndarray:
         """Fill the hole; see ``Inpainter.fill``."""
         flag = cv2.INPAINT_TELEA if self.method is OpenCvMethod.TELEA else cv2.INPAINT_NS
@@ -80,7 +94,13 @@ class OnnxInpainter:
     path: Path
 
     def fill(
-        self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
+        self,
+        image: np.ndarray,
+        hole: np.ndarray,
+        known: np.ndarray,
+        shade: np.ndarray | None = None,
+        *,
+        progress: Callable[[float], None] = lambda done: None,
     ) -> np.ndarray:
         """Fill the hole; see ``Inpainter.fill``. Raises ``UserError`` if the file is not an inpainting network."""
         file, network = self._load()
@@ -121,7 +141,13 @@ class TorchScriptInpainter:
     """PyTorch device on which the network runs."""
 
     def fill(
-        self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
+        self,
+        image: np.ndarray,
+        hole: np.ndarray,
+        known: np.ndarray,
+        shade: np.ndarray | None = None,
+        *,
+        progress: Callable[[float], None] = lambda done: None,
     ) -> np.ndarray:
         """Fill the hole; see ``Inpainter.fill``. Raises ``UserError`` if the file is not an inpainting network."""
         torch, network = self._load()

@@ -13,6 +13,8 @@ from egs_warp.locomotion.planner import MIN_STEPS_PER_TIME_UNIT
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.push import Push
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.support import SupportPolygon
 from egs_warp.pipelines.creature import Creature, CreatureOptions, creature_in_cage, initial_stance
 from egs_warp.pipelines.end_state import MAX_END_TILT, has_upright_pose
 from egs_warp.pipelines.facing_direction import Front
@@ -24,8 +26,8 @@ _STAND_TIME = 6.0
 _MOTION = "stand 60"
 """Motion of the check, which the number of frames ends before it is complete."""
 _IMPULSE = 0.05
-"""Impulse of the push at the start, in units of m sqrt(g H). Without a push, a body on a wide base would stand even
-without muscles."""
+"""Impulse of the push at the start, in units of m sqrt(g H). It tips a rigid body over an edge of its base that is
+within about 0.03 H of its centre of mass."""
 
 
 def own_muscles_notes(cloud: GaussianCloud, standing: PlacedCage, facing: Front, muscles_file: Path) -> tuple[str, ...]:
@@ -43,7 +45,11 @@ def own_muscles_notes(cloud: GaussianCloud, standing: PlacedCage, facing: Front,
 
 
 def balance_note(creature: Creature) -> str | None:
-    """Return a note for the user if ``creature`` falls over in a short stand with a gentle push; None if it stands."""
+    """Return a note for the user if ``creature`` falls over in a short stand; None if it stands.
+
+    At the start, it is pushed gently towards the nearest edge of its base. A body that stands even without muscles gets
+    no note.
+    """
     place = initial_stance(creature)
     if not has_upright_pose(place.base()):
         return None
@@ -55,7 +61,7 @@ def balance_note(creature: Creature) -> str | None:
         _MOTION,
         frames=max(MIN_FRAMES, 1 + int(np.ceil(_STAND_TIME * creature.body.time_unit / frame))),
         step=step,
-        pushes=(Push(0.0, np.array([_IMPULSE, 0.0, 0.0])),),
+        pushes=(Push(0.0, _IMPULSE * _direction_to_edge(place)),),
         get_up=False,
     )
     tilt = measure(run.trajectory).tilt_degrees
@@ -67,3 +73,10 @@ def balance_note(creature: Creature) -> str | None:
         f" {run.trajectory.time[-1]:.1f} s in a short stand; give more or stronger fibres, from the base to the top on"
         " all sides"
     )
+
+
+def _direction_to_edge(place: Stance) -> np.ndarray:
+    """Return the unit vector (3,), ground axes, from the centre of mass to the nearest edge of the base."""
+    base = SupportPolygon.hull(place.ground.local(place.contact_points)[:, :2])
+    centre = place.ground.local(place.body.centre_of_mass(place.standing))[:2]
+    return np.array([*base.normals[np.argmin(base.offsets - base.normals @ centre)], 0.0])

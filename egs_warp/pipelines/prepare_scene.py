@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,19 +18,20 @@ from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, hole_under
+from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
 from egs_warp.inpainting.underside import with_underside
 from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.lighting.estimate import estimate_light
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
+from egs_warp.pipelines.scene_costs import scene_costs
 from egs_warp.segmentation.clearance import StraddlingOptions, StraddlingPolicy, clear_plane, plane_extents
 from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.short_repr import short_repr
 from egs_warp.training import has_torch
 
 if TYPE_CHECKING:
-    from egs_warp.inpainting.inpaint import InpaintResult
     from egs_warp.inpainting.inpainters import Inpainter
     from egs_warp.training.finetune import TrainingView
 
@@ -44,6 +45,8 @@ _CLEARED = {
 
 _SOLID = 0.1
 """Minimum opacity of Gaussians that define the lowest part of an object."""
+_TRAINED = 0.6
+"""Finished fraction of the stage "segment" after the training at the plane; the light is estimated in the rest."""
 _HOVER_FRACTION = 0.03
 """Distance from the plane above which an object hovers, as a fraction of the object's size."""
 
@@ -69,11 +72,24 @@ class SceneOptions:
         return self.clearing or (StraddlingPolicy.FINETUNE if has_torch() else StraddlingPolicy.SPLIT)
 
     @property
-    def stages(self) -> dict[str, bool]:
-        """Stages of ``prepare_scene`` in their order; the value is False for a stage that runs without its training."""
-        requested = {"plane": True, "ground": not self.flat, "segment": True, "inpaint": self.inpaint}
-        whole = {"segment": self.method is StraddlingPolicy.FINETUNE, "inpaint": has_torch()}
-        return {name: whole.get(name, True) for name, is_requested in requested.items() if is_requested}
+    def inpainting_steps(self) -> int | None:
+        """Number of training steps of the inpainting; None if the hole is not filled."""
+        if not self.inpaint:
+            return None
+        return InpaintOptions().steps if has_torch() else 0
+
+    def costs(
+        self, gaussian_count: int, *, object_count: int | None = None, hole: Hole | None = None
+    ) -> dict[str, float]:
+        """Return the expected processor time of each stage of ``prepare_scene``, s, in order (``scene_costs``)."""
+        return scene_costs(
+            gaussian_count,
+            has_ground=not self.flat,
+            clearing_steps=self.clearing_options.iterations if self.method is StraddlingPolicy.FINETUNE else 0,
+            inpainting_steps=self.inpainting_steps,
+            object_count=object_count,
+            hole=hole,
+        )
 
 
 @dataclass(frozen=True)
@@ -130,6 +146,7 @@ def prepare_scene(
     plane: Plane | None = None,
     options: SceneOptions | None = None,
     progress: Callable[[str, float], None] = lambda stage, done: None,
+    expect_costs: Callable[[Mapping[str, float]], None] = lambda costs: None,
 ) -> PreparedScene:
     """Separate a capture into object and background: plane, segmentation, clearing of the plane, inpainting.
 
@@ -143,6 +160,8 @@ def prepare_scene(
         plane: The ground plane; None finds it.
         options: Options; None uses the default.
         progress: Called with the name of a stage and its finished fraction.
+        expect_costs: Called with the expected processor time of all stages (``SceneOptions.costs``) when the sizes of
+            object and hole are known.
 
     Raises:
         UserError: A stage failed.
@@ -155,26 +174,28 @@ def prepare_scene(
     if not options.flat:
         progress("ground", 0.0)
         located = with_measured_ground(cloud, located, spec, cameras)
+    hole = hole_under(cloud, located.plane, located.segmentation)
+    expected = replace(options, inpaint=options.inpaint and hole is not None and located.in_sight)
+    object_count = int(located.segmentation.object_mask.sum())
+    expect_costs(expected.costs(cloud.count, object_count=object_count, hole=hole))
     progress("segment", 0.0)
     object_cloud, background_with_hole, notes = segment_scene(
-        cloud, located, options, photographs, progress=lambda done: progress("segment", done)
+        cloud, located, options, photographs, progress=lambda done: progress("segment", _TRAINED * done)
     )
     object_cloud, snap_notes = snap_to_plane(object_cloud, located)
     notes = (*notes, *snap_notes)
     # Estimate the light before the hole is filled, because the fill replaces a part of the shadow.
     lighting = estimate_light(object_cloud, background_with_hole, located.ground or located.plane)
     notes = (*notes, lighting.note)
-    filled, hole = None, hole_under(cloud, located.plane, located.segmentation)
+    filled = None
     if options.inpaint and hole is None:
         notes = (*notes, "the object hangs above the ground, and the ground under it is complete")
     elif options.inpaint and not located.in_sight:
         notes = (*notes, "what is under the object was not filled, because no view shows where the ground is")
     elif options.inpaint and hole is not None:
         progress("inpaint", 0.0)
-        # Import lazily: torch, which the final training of the inpainting needs, may be missing.
-        from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
-
-        chosen = InpaintOptions() if has_torch() else InpaintOptions(steps=0)
+        assert options.inpainting_steps is not None
+        chosen = InpaintOptions(steps=options.inpainting_steps)
         show_inpainting = lambda done: progress("inpaint", done)  # noqa: E731
         try:
             filled = inpaint(

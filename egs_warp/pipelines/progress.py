@@ -26,13 +26,8 @@ four captures)."""
 _CONVERSION_STAGES = {".compressed.ply": 37, ".ply": 27, ".spz": 65, ".sog": 80, ".splat": 1, ".glb": 11}
 """Elapsed time of a conversion, percent of the total, when the file has been written and its comparison with the source
 starts; by name ending (400,000 Gaussians of SH degree 3 on a CPU)."""
-_SCENE_SHARES = {"plane": 12, "ground": 15, "segment": 49, "inpaint": 24}
-"""Duration of each stage of a scene, percent of the total: median of two built-in scenes (koala, narcissus) on a CPU.
-The starts of the stages that follow from it deviate from the measured ones by at most 16 percentage points."""
 _PHOTOS_SHARES = {"pose": 20, "train": 50, "pick": 1, "scene": 15, "prepare": 2, "simulate": 7, "render": 5}
 """Duration of each stage from photos to a film on a CPU, percent of the total."""
-_UNTRAINED_SHARE = 2
-"""Duration of a stage without its training, in the same unit as the shares above."""
 _SMOOTHING = 0.05
 """Smoothing factor of the frame rate. It is small because frames in the air and on the ground alternate, and a frame in
 the air takes a third of the time."""
@@ -42,7 +37,8 @@ _MIN_LEFT = 0.3
 """Minimum remaining time of a stage, as a fraction of its elapsed time, because a stage that takes longer than usual is
 not about to end."""
 _RELIABLE_FRACTION = 0.1
-"""Finished fraction of a stage from which its own speed, not its usual share, defines its remaining time."""
+"""Fraction of a stage, finished since its first report, from which its own speed, not its usual share, defines its
+remaining time."""
 _UPDATE_INTERVAL, _LOG_INTERVAL = 0.25, 10.0
 """Intervals between two updates of ``photos_bar``, s: on a terminal, and in a log."""
 _outer: ContextVar[PhotosBar | None] = ContextVar("_outer", default=None)
@@ -53,7 +49,7 @@ _outer: ContextVar[PhotosBar | None] = ContextVar("_outer", default=None)
 def photos_bar(stages: Sequence[str], *, quiet: bool = False, file: TextIO | None = None) -> Iterator[PhotosBar]:
     """Show one bar on ``file`` (default stderr) for all ``stages`` from photos to a film."""
     shares = {stage: _PHOTOS_SHARES[stage] for stage in stages}
-    with _StageBar("photos to film", shares, quiet=quiet, file=file) as bar:
+    with StageBar("photos to film", shares, quiet=quiet, file=file) as bar:
         is_terminal = (file or sys.stderr).isatty()
         shown = PhotosBar(bar, _UPDATE_INTERVAL if is_terminal else _LOG_INTERVAL)
         token = _outer.set(shown)
@@ -66,7 +62,7 @@ def photos_bar(stages: Sequence[str], *, quiet: bool = False, file: TextIO | Non
 class PhotosBar:
     """Bar of all stages from photos to a film."""
 
-    def __init__(self, bar: _StageBar, interval: float) -> None:
+    def __init__(self, bar: StageBar, interval: float) -> None:
         self._bar, self._interval = bar, interval
         self._stage, self._shown = "", 0.0
 
@@ -108,16 +104,14 @@ def conversion_bar(name: str, *, quiet: bool = False, file: TextIO | None = None
 
 
 @contextmanager
-def scene_bar(
-    stages: Mapping[str, bool], *, quiet: bool = False, file: TextIO | None = None
-) -> Iterator[Callable[[str, float], None]]:
-    """Show a bar on ``file`` (default stderr) for ``prepare_scene``, and yield its ``progress`` argument.
+def scene_bar(costs: Mapping[str, float], *, quiet: bool = False, file: TextIO | None = None) -> Iterator[StageBar]:
+    """Show a bar on ``file`` (default stderr) for ``prepare_scene``.
 
-    ``stages`` is the value of ``SceneOptions.stages``.
+    ``costs`` is the value of ``SceneOptions.costs``. The methods ``update`` and ``expect`` of the yielded bar are the
+    arguments ``progress`` and ``expect_costs`` of ``prepare_scene``.
     """
-    shares = {stage: _SCENE_SHARES[stage] if whole else _UNTRAINED_SHARE for stage, whole in stages.items()}
-    with _StageBar("scene", shares, quiet=quiet, file=file) as bar:
-        yield bar.update
+    with StageBar("scene", costs, quiet=quiet, file=file) as bar:
+        yield bar
 
 
 @contextmanager
@@ -163,7 +157,7 @@ def _stages(name: str, done: Mapping[str, int], *, quiet: bool, file: TextIO | N
     """
     ends = [*list(done.values())[1:], 100]
     shares = {stage: end - start for (stage, start), end in zip(done.items(), ends, strict=True)}
-    with _StageBar(name, shares, quiet=quiet, file=file) as bar:
+    with StageBar(name, shares, quiet=quiet, file=file) as bar:
         yield bar.update
 
 
@@ -189,7 +183,7 @@ def _redrawn(draw: Callable[[], object], *, quiet: bool, file: TextIO | None) ->
         thread.join()
 
 
-class _StageBar:
+class StageBar:
     """Progress line with the stage, the elapsed and the remaining time of a computation.
 
     Each stage takes a known share of the total time.
@@ -203,9 +197,10 @@ class _StageBar:
         self._outer = _outer.get()
         self._bar: Any = None
         self._stage, self._stage_start, self._done = "", 0.0, 0.0
+        self._first: tuple[float, float] | None = None
         self._stack = ExitStack()
 
-    def __enter__(self) -> _StageBar:
+    def __enter__(self) -> StageBar:
         return self
 
     def __exit__(
@@ -224,7 +219,9 @@ class _StageBar:
             self._stack.push(self._show_end)
             self._stack.enter_context(_redrawn(self._draw, quiet=self._is_quiet, file=self._options["file"]))
         if stage != self._stage:
-            self._stage, self._stage_start = stage, self._elapsed()
+            self._stage, self._stage_start, self._first = stage, self._elapsed(), None
+        if done > 0.0 and self._first is None:
+            self._first = self._elapsed(), done
         self._done = done
         self._draw()
 
@@ -233,6 +230,11 @@ class _StageBar:
         self._shares = {stage: share for stage, share in self._shares.items() if stage not in stages}
         self._starts = dict(zip(self._shares, accumulate(self._shares.values(), initial=0.0), strict=False))
         self._total = sum(self._shares.values())
+
+    def expect(self, shares: Mapping[str, float]) -> None:
+        """Replace the expected shares of the stages by better ones."""
+        self._shares = dict(shares)
+        self.skip(())
 
     def _show_end(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         if kind is None:
@@ -253,13 +255,15 @@ class _StageBar:
     def _left(self, elapsed: float) -> float | None:
         """Return the remaining time, s, ``elapsed`` seconds after the start; None before it can be estimated.
 
-        The time per share is measured in the earlier stages, or in the finished part of the current one. A stage that
-        takes longer than its share is expected to continue for some time.
+        The time per share is measured in the earlier stages, or in the current one since its first report, because the
+        first step may include an import. A stage that takes longer than its share is expected to continue for some
+        time.
         """
         share, start = self._shares.get(self._stage, 0.0), self._starts.get(self._stage, self._total)
         spent = elapsed - self._stage_start
-        if self._done >= _RELIABLE_FRACTION:
-            stage_left = spent * (1.0 - self._done) / self._done
+        first_time, first_done = self._first or (elapsed, self._done)
+        if self._done - first_done >= _RELIABLE_FRACTION:
+            stage_left = (elapsed - first_time) * (1.0 - self._done) / (self._done - first_done)
         elif start > 0.0:
             stage_left = max(self._stage_start / start * share - spent, _MIN_LEFT * spent)
         else:

@@ -4,7 +4,12 @@ Input: a cloud and views to match. Output: a cloud whose renders match the views
 (Eq. 21) and trains inpainted floor. The kernels are in ``egs_warp/kernels/training``.
 """
 
+import os
 from importlib.util import find_spec
+
+# OpenMP reads this when PyTorch is imported. By default, its threads wait for each other in busy loops, which made a
+# training step 20 times slower on a machine on which other processes use the cores.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def has_torch() -> bool:

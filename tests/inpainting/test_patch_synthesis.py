@@ -54,15 +54,19 @@ def test_labels_point_to_similar_known_texels() -> None:
 
 def test_a_repeating_texture_is_continued(device: str) -> None:
     """The PSNR is at least 40 dB and 15 dB above OpenCV's; nothing outside the hole changes; results are
-    deterministic."""
+    deterministic. The reported progress rises to 1."""
     image = picture()
     hole = round_hole(128, (70, 60), 17) | round_hole(128, (20, 100), 6)
     holed = np.where(hole[..., None], 0.0, image).astype(np.float32)
-    filled = PatchSynthesis(device=device).fill(holed, hole, ~hole)
+    reported: list[float] = []
+    filled = PatchSynthesis(device=device).fill(holed, hole, ~hole, progress=reported.append)
     smooth = cv2.inpaint(np.rint(255 * holed).astype(np.uint8), hole.astype(np.uint8), 5, cv2.INPAINT_TELEA) / 255.0
     assert psnr(filled[hole], image[hole]) > max(40.0, psnr(smooth[hole], image[hole]) + 15.0)
     assert np.array_equal(filled[~hole], image[~hole])
     assert np.array_equal(filled, PatchSynthesis(device=device).fill(holed, hole, ~hole))
+    assert reported == sorted(reported)
+    assert reported[0] < 0.6
+    assert reported[-1] == pytest.approx(1.0)
 
 
 def test_an_illumination_gradient_leaves_no_seam() -> None:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 from egs_warp.assets import pawn
 from egs_warp.cli import main
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
 from egs_warp.io import write_ply
 from egs_warp.motions.script import motion
 from egs_warp.pipelines import balance
 from egs_warp.pipelines.balance import balance_note
+from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn
 
@@ -31,6 +36,35 @@ def test_a_body_that_falls_over_is_reported_and_one_that_stands_is_not(monkeypat
     assert note.startswith(f"muscles: {creature.muscles.segment_count} segments cannot hold it upright: it tilts by ")
     after = simulate(creature, motion("jump"), frames=3).trajectory
     np.testing.assert_array_equal(after.positions, before.positions)
+
+
+@pytest.mark.parametrize("lean", [0.75, -0.75])
+def test_a_weak_fibre_is_reported_if_the_body_must_balance(lean: float, tmp_path: Path) -> None:
+    """A leaning pawn, whose centre of mass is 0.03 of its height from an edge of its base, falls with one fibre of 0.01
+    body weights, on whichever side the edge is."""
+    built = pawn(gaussian_count=3000)
+    means = built.cloud.means.numpy()
+    means[:, 0] += lean * means[:, 2]
+    cloud = replace(built.cloud, means=wp.array(means, dtype=wp.vec3))
+    note = balance_note(_with_one_fibre(cloud, built.plane, tmp_path, lean, strength=0.01))
+    assert note is not None
+    assert note.startswith("muscles: 4 segments cannot hold it upright: it tilts by ")
+    assert "\n" not in note
+
+
+def test_a_body_that_stands_without_muscles_is_not_reported(tmp_path: Path) -> None:
+    built = pawn(gaussian_count=3000)
+    assert balance_note(_with_one_fibre(built.cloud, built.plane, tmp_path, 0.0, strength=0.01)) is None
+
+
+def _with_one_fibre(cloud: GaussianCloud, plane: Plane, folder: Path, lean: float, *, strength: float) -> Creature:
+    """Return the creature with one fibre of ``strength`` body weights along the axis of the leaning body."""
+    ends = {"from": [0.1 * lean, 0.0, 0.1], "to": [0.6 * lean, 0.0, 0.6]}
+    fibre = {"name": "weak", "kind": "longitudinal", "strength": strength, **ends}
+    file = folder / "own.json"
+    file.write_text(json.dumps({"fibres": [fibre]}))
+    options = CreatureOptions(nodes=50, muscles_file=file, front=np.array([1.0, 0.0, 0.0]))
+    return make_creature(cloud, plane=plane, options=options)
 
 
 @pytest.mark.slow

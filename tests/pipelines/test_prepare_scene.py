@@ -3,7 +3,7 @@ is written."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -205,15 +205,17 @@ def test_an_animation_that_fails_loses_none_of_the_parts(
 def test_a_scene_is_prepared_and_viewed_from_its_cameras() -> None:
     cloud, _ = ball_on_floor()
     told: list[tuple[str, float]] = []
+    costs: list[Mapping[str, float]] = []
     options = SceneOptions(clearing=StraddlingPolicy.SPLIT, inpaint=False)
     prepared = prepare_scene(
         cloud,
         ObjectSpec(point=np.array([0.0, -0.5, 0.5])),
         options=options,
         progress=lambda stage, done: told.append((stage, done)),
+        expect_costs=costs.append,
     )
-    assert told == [(stage, 0.0) for stage in options.stages]
-    assert options.stages == {"plane": True, "ground": True, "segment": False}
+    assert told == [("plane", 0.0), ("ground", 0.0), ("segment", 0.0)]
+    assert [list(one) for one in costs] == [["plane", "ground", "segment"]]
     assert prepared.background is prepared.background_with_hole
     assert any("straddled the plane: split at it" in note for note in prepared.notes)
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=12, elevations=(20.0, 40.0, 60.0))

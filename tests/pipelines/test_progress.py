@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import io
 import time
+from collections.abc import Mapping
 from functools import partial
 
+import numpy as np
 import pytest
 
+from egs_warp.geometry.plane import Plane
+from egs_warp.inpainting.holes import Hole
+from egs_warp.inpainting.rectified import PlaneWindow
 from egs_warp.pipelines.prepare_scene import SceneOptions
 from egs_warp.pipelines.progress import (
     conversion_bar,
@@ -28,37 +33,77 @@ class Terminal(io.StringIO):
         return True
 
 
-def drawn(options: SceneOptions, monkeypatch: pytest.MonkeyPatch, told: list[tuple[float, str, float]]) -> list[str]:
+def drawn(
+    costs: Mapping[str, float], monkeypatch: pytest.MonkeyPatch, told: list[tuple[float, str, float]]
+) -> list[str]:
     """Return the displayed line after each of ``told``: seconds since the start, stage, completed fraction."""
     clock = [1000.0]
     monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
     file, lines = io.StringIO(), []
-    with scene_bar(options.stages, file=file) as tell:
+    with scene_bar(costs, file=file) as bar:
         for seconds, stage, done in told:
             clock[0] = 1000.0 + seconds
-            tell(stage, done)
+            bar.update(stage, done)
             lines.append(file.getvalue().split("\r")[-1].strip())
     assert file.getvalue().split("\r")[-1].startswith("scene: done, ")
     return lines
 
 
 def test_a_scene_shows_its_stages_and_the_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The remaining time follows from the typical fractions of the stages and the completed fraction of the current
-    one; in the middle of the longest stage, it is close to the elapsed time."""
-    told = [(0.0, "plane", 0.0), (12.0, "ground", 0.0), (27.0, "segment", 0.0), (50.0, "segment", 0.5)]
-    assert drawn(SceneOptions(clearing=StraddlingPolicy.FINETUNE), monkeypatch, told) == [
+    """The remaining time follows from the expected costs of the stages, and from the speed of the current one since its
+    first report: its first step may include an import."""
+    costs = {"plane": 12.0, "ground": 15.0, "segment": 48.0, "inpaint": 25.0}
+    told = [
+        (0.0, "plane", 0.0),
+        (12.0, "ground", 0.0),
+        (27.0, "segment", 0.0),
+        (47.0, "segment", 0.1),
+        (50.0, "segment", 0.2),
+        (59.0, "segment", 0.5),
+    ]
+    assert drawn(costs, monkeypatch, told) == [
         "scene: plane, 00:00<?",
         "scene: ground, 00:12<01:28",
         "scene: segment, 00:27<01:13",
-        "scene: segment, 00:50<00:46",
+        "scene: segment, 00:47<00:53",
+        "scene: segment, 00:50<00:48",
+        "scene: segment, 00:59<00:39",
     ]
+
+
+def test_better_costs_replace_the_expected_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """When object and hole are known, the inpainting is expected to take half as long."""
+    clock, file = [1000.0], io.StringIO()
+    monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
+    with scene_bar({"plane": 10.0, "segment": 10.0, "inpaint": 40.0}, file=file) as bar:
+        bar.update("plane")
+        clock[0] += 10.0
+        bar.expect({"plane": 10.0, "segment": 10.0, "inpaint": 20.0})
+        bar.update("segment")
+        assert file.getvalue().split("\r")[-1].strip() == "scene: segment, 00:10<00:30"
 
 
 def test_skipped_stages_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """If ground, training and inpainting are skipped, little time remains after the plane."""
     options = SceneOptions(clearing=StraddlingPolicy.SPLIT, flat=True, inpaint=False)
-    lines = drawn(options, monkeypatch, [(0.0, "plane", 0.0), (12.0, "segment", 0.0)])
-    assert lines[1] == "scene: segment, 00:12<00:02"
+    costs = options.costs(50_000)
+    assert list(costs) == ["plane", "segment"]
+    assert costs["segment"] < costs["plane"]
+
+
+def test_the_costs_of_a_scene_follow_its_sizes() -> None:
+    """The training at the plane grows with the object. The inpainting does not depend on the hole's size in
+    the scene."""
+    options = SceneOptions(clearing=StraddlingPolicy.FINETUNE)
+    few, many = (options.costs(50_000, object_count=count) for count in (10_000, 40_000))
+    assert many["segment"] > few["segment"] + 0.5
+    rows, columns = np.indices((40, 40)) - 20
+    square = np.maximum(abs(rows), abs(columns)) < 15
+    floor = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+    small, large = (Hole(PlaneWindow(floor, np.zeros(3), texel, 40, 40), square) for texel in (0.01, 1.0))
+    costs = [options.costs(50_000, hole=hole)["inpaint"] for hole in (small, large)]
+    assert costs[0] == pytest.approx(costs[1])
+    assert options.costs(50_000)["inpaint"] == pytest.approx(costs[0], rel=0.5)
 
 
 def test_stages_show_the_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,10 +182,10 @@ def test_all_stages_from_photos_to_a_film_share_one_line(
         bar.skip("pose")
         bar.update("train")
         clock[0] += 100.0
-        with scene_bar({"plane": True, "segment": True}) as progress:
-            progress("plane", 0.0)
+        with scene_bar({"plane": 12.0, "segment": 49.0}) as scene:
+            scene.update("plane")
             shown()
-            progress("segment", 0.0)
+            scene.update("segment")
         with preparation_bar() as begin_stage:
             begin_stage("stand")
             begin_stage("balance")
