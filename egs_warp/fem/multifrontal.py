@@ -116,6 +116,8 @@ class MultifrontalLdl:
         self._no_projection, self._projection = _ProjectionArrays(0).struct, _ProjectionArrays(self._unknowns)
         self._projection.struct.enabled = 1
         self._effort: _EffortWorkspace | None = None
+        self._loaded: set[Any] = set()
+        """Kernels whose modules are loaded."""
         self._added: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         """U (n, k), S^-1 U (n, k) and the inverse (k, k) of the capacitance matrix diag(1/r) + U^T S^-1 U."""
         self.negative_pivots = -1
@@ -250,6 +252,10 @@ class MultifrontalLdl:
             launch_cached(kernel, 1, inputs=[self._counters_array, *inputs], outputs=outputs, device=self._device)
 
         if panels > 1:
+            if kernel not in self._loaded:
+                # Loading a module is not safe from two threads at once.
+                kernel.module.load(self._device, block_dim=1)
+                self._loaded.add(kernel)
             run_concurrently(launch, launch)
         else:
             launch()
