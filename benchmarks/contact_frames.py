@@ -17,7 +17,8 @@ from egs_warp.locomotion.contact_modes import CoulombProgram, PredictedContact
 from egs_warp.locomotion.objectives import AngularMomentumObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.settling import settle
-from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart, make_step_linearizer
+from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart
+from egs_warp.locomotion.stepper_parts import make_step_linearizer
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.meshing.cage import build_cage
 from egs_warp.motions.stance import Weights

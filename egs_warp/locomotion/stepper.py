@@ -18,27 +18,20 @@ import numpy as np
 from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coupled_step import CoupledResult, CoupledSolver
 from egs_warp.contact.detection import ContactDetector, ContactGeometry
-from egs_warp.contact.newton import ContactLinearization, ContactLinearizer
+from egs_warp.contact.newton import ContactLinearization
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batched import BatchedRecord
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.linear_solver import LinearSolver
-from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.linear_step import (
-    HostStepLinearizer,
-    PredictedStep,
-    StepInputs,
-    StepLinearizer,
-)
+from egs_warp.locomotion.linear_step import PredictedStep, StepInputs
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import MIN_STEPS_PER_TIME_UNIT, Plan, StageClock, StepPlanner
 from egs_warp.locomotion.prediction import predict_end
 from egs_warp.locomotion.settings import LocomotionSettings
-from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.step_cost import objectives_value
-from egs_warp.locomotion.strategies import Strategy
-from egs_warp.locomotion.synergies import Synergies, find_synergies
+from egs_warp.locomotion.stepper_parts import make_device_planner, make_linearizer, make_step_linearizer
+from egs_warp.locomotion.synergies import find_synergies
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy, activation_jacobian
@@ -142,7 +135,7 @@ class LocomotionStepper:
     def _make_planners(self, planning_factors: LinearSolver) -> None:
         """Build the objects that depend on the elasticity of the body: linearizer, synergies and planners."""
         body, muscles = self.body, self.muscles
-        self.linearizer = _make_linearizer(self.factors, body, muscles, self.solver)
+        self.linearizer = make_linearizer(self.factors, body, muscles, self.solver)
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
         # One thread, so that the synergies do not depend on the number of threads.
         with one_blas_thread():
@@ -159,7 +152,7 @@ class LocomotionStepper:
             planning_factors,
             make_step_linearizer(self.linearizer, muscles, synergies),
         )
-        self._device_planner = _make_device_planner(self.planner, self.linearizer, self.solver)
+        self._device_planner = make_device_planner(self.planner, self.linearizer, self.solver)
         # The prefetched inputs of the next step, with the warm start for which they are valid.
         self._prefetched: tuple[WarmStart, StepInputs] | None = None
 
@@ -479,45 +472,3 @@ class LocomotionStepper:
             milliseconds=clock.milliseconds,
         )
         return after, WarmStart.from_report(report), report
-
-
-def _make_linearizer(
-    factors: LinearSolver, body: SoftBody, muscles: MuscleSet, solver: CoupledSolver
-) -> ContactLinearizer:
-    """Return the contact linearizer for tangents of ``body``: on the host, or on the device of ``factors``."""
-    if isinstance(factors, MultifrontalLdl):
-        return ContactLinearizer()
-    from egs_warp.contact.device_newton import DeviceContactLinearizer
-    from egs_warp.contact.prefetch import ContactPrefetch
-    from egs_warp.fem.tiled_cholesky import TiledCholesky
-
-    assert isinstance(factors, TiledCholesky)
-    prefetch = ContactPrefetch(solver.detector, solver.points, factors.stream, solver.penetration_tolerance)
-    return DeviceContactLinearizer(factors, body, muscles, prefetch)
-
-
-def make_step_linearizer(linearizer: ContactLinearizer, muscles: MuscleSet, synergies: Synergies) -> StepLinearizer:
-    """Return the step linearizer that matches ``linearizer``: on the host or on its device."""
-    if linearizer.is_on_host:
-        return HostStepLinearizer(muscles, synergies)
-    from egs_warp.contact.device_newton import DeviceContactLinearizer
-    from egs_warp.locomotion.device_linear_step import DeviceLinearSteps
-
-    assert isinstance(linearizer, DeviceContactLinearizer)
-    return DeviceLinearSteps(linearizer, muscles, synergies)
-
-
-def _make_device_planner(planner: StepPlanner, linearizer: ContactLinearizer, solver: CoupledSolver) -> Any:
-    """Return a device planner, or None if the matrices are on the host or the strategy or the QP solver runs on the
-    host."""
-    settings, device = planner.settings, planner.body.assembly.device
-    if linearizer.is_on_host or Strategy(settings.strategy) is not Strategy.MODES:
-        return None
-    if settings.qp_solver_on(device) is not QpSolver.ADMM:
-        return None
-    from egs_warp.contact.device_newton import DeviceContactLinearizer
-    from egs_warp.locomotion.device_linear_step import DeviceLinearSteps
-    from egs_warp.locomotion.device_plan import DevicePlanner
-
-    assert isinstance(linearizer, DeviceContactLinearizer) and isinstance(planner.linear_steps, DeviceLinearSteps)
-    return DevicePlanner(planner, linearizer, planner.linear_steps, solver.progress)
