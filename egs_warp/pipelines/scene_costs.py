@@ -1,7 +1,7 @@
 """Expected processor times of the stages of preparing a scene, from the sizes of the scene.
 
-The constants were measured for koala, fox and narcissus, in this order (50,000 to 101,000 Gaussians), on one core of a
-CPU. Progress bars use only the ratios of the times, which differ less between machines than the times themselves.
+The constants were measured for koala, fox and narcissus (50,000 to 101,000 Gaussians) on one core of a CPU. Progress
+bars use only the ratios of the times, which differ less between machines than the times themselves.
 """
 
 from __future__ import annotations
