@@ -25,8 +25,8 @@ def is_world(capture: str) -> bool:
 
 
 def animate_world(args: argparse.Namespace) -> bool:
-    """Run ``egs-warp animate`` for a world file, with the output folder already checked; return True if a body did not
-    do what was requested."""
+    """Run ``egs-warp animate`` for a world file; return True if the exit status must report a failure. The caller has
+    checked the output folder."""
     from egs_warp.io.run_folder import run_folder
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.motions.style import read_style

@@ -135,7 +135,7 @@ def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
 def pick_automatically(args: argparse.Namespace) -> None:
     """Write ``args.out`` with the object of ``--object``, or with the object that the page would propose first.
 
-    Raises ``UserError`` if there is no object in the middle of the capture, or if the proposal is doubtful.
+    Raises ``UserError`` if no object is found, or if the proposal is doubtful.
     """
     from egs_warp.commands.scene_input import read_scene
     from egs_warp.io.picked import PickedFile, PickedObject, write_picked

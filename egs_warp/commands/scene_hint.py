@@ -10,10 +10,10 @@ from egs_warp.geometry.gaussians import GaussianCloud
 _SOLID = 0.3
 """Minimum opacity of a Gaussian to be considered."""
 _LOW_PART = 0.2
-"""Height of the low part of a capture, as a fraction of its height."""
+"""Height of the low part of a capture, as a fraction of the height of the capture."""
 _MIN_WIDTH_RATIO = 2.0
-"""Minimum width of the low part of a scene, divided by the width of what is above it. The captures of single objects
-that were measured have at most 1.7 (a pawn on its wide base)."""
+"""Minimum ratio of the width of the low part of a scene to the width of the rest. In the measured captures of single
+objects, the ratio is at most 1.7 (a pawn with a wide base)."""
 
 
 def scene_notes(cloud: GaussianCloud, up: np.ndarray | None) -> list[str]:
@@ -21,7 +21,7 @@ def scene_notes(cloud: GaussianCloud, up: np.ndarray | None) -> list[str]:
 
     Args:
         cloud: Capture without a selected object.
-        up: (3,) unit vector that points up; without it, nothing is known.
+        up: (3,) unit vector that points up; None if it is unknown, which gives no note.
     """
     means = cloud.means.numpy()[cloud.opacities() > _SOLID].astype(np.float64)
     if up is None or len(means) == 0:

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions
 
 _MAX_REST = 0.05
-"""Maximum share of the capture's opacity outside an object for the object to be the whole capture. In a short training
-of an object on a white desk or a turntable, the share of the haze is 0.01 to 0.03."""
+"""Maximum share of the total opacity of a capture that is outside an object that counts as the whole capture. For an
+object on a white desk or a turntable, the share of the haze after a short training is 0.01 to 0.03."""
 
 
 @dataclass(frozen=True)

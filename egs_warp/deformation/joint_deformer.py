@@ -15,11 +15,10 @@ from egs_warp.launching import empty
 
 
 class JointDeformer:
-    """Deformer of the clouds of several bodies, each with its own cage, into one cloud. Colour bands that only some of
-    the clouds have are zero for the others."""
+    """Deformer of several bodies, each with its own cage, into one cloud. Missing SH bands of a body are zero."""
 
     def __init__(self, deformers: Sequence[Deformer], *, fixed: GaussianCloud | None = None) -> None:
-        """Join the clouds of ``deformers`` and, after them, the cloud ``fixed``, which does not move."""
+        """Concatenate the clouds of ``deformers`` and then the cloud ``fixed``, which does not move."""
         self._deformers = tuple(deformers)
         clouds = [*(deformer.rest for deformer in deformers), *([] if fixed is None else [fixed])]
         degree = max(cloud.sh_degree for cloud in clouds)
@@ -33,7 +32,7 @@ class JointDeformer:
         self._deformed.rotations.fill_(wp.vec4(1.0, 0.0, 0.0, 0.0))
 
     def deform(self, poses: Sequence[np.ndarray]) -> DeformedGaussians:
-        """Deform all bodies; ``poses`` are the node positions (N, 3) m of each. The next call overwrites the result."""
+        """Deform all bodies. ``poses`` has the node positions (N, 3) m of each; the next call overwrites the result."""
         deformed, first = self._deformed, 0
         for deformer, positions in zip(self._deformers, poses, strict=True):
             part = deformer.deform(positions)
@@ -45,13 +44,13 @@ class JointDeformer:
 
 
 def _copy_rows(target: Any, source: wp.array, first: int) -> None:
-    """Copy the rows of ``source`` into ``target``, beginning at the row ``first``."""
+    """Copy ``source`` into the rows of ``target`` from row ``first`` on."""
     rows = target[first : first + source.shape[0]]
     wp.copy(rows if rows.ndim == 1 else rows[:, : source.shape[1]], source)
 
 
 def _with_bands(cloud: GaussianCloud, degree: int) -> GaussianCloud:
-    """Return ``cloud`` with the colour bands up to ``degree``, added ones zero."""
+    """Return ``cloud`` with SH bands up to ``degree``; missing bands are zero."""
     sh = with_degree(cloud, degree).sh.numpy()
     missing = (degree + 1) ** 2 - (cloud.sh_degree + 1) ** 2
     if missing == 0:

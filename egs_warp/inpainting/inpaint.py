@@ -62,13 +62,13 @@ _MAX_ISLAND_AREA = 0.15
 _COLOUR_WEIGHT = 4.0
 """Weight of the squared distance between a Gaussian's colour and the painted colour."""
 _RECTIFY_COST = 0.9
-"""Processor time of the face-on picture, s; measured for koala, fox, narcissus and pawn on a CPU: 0.8 to 1.2 s."""
+"""Processor time of rendering the face-on picture, s; 0.8 to 1.2 s for koala, fox, narcissus and pawn on a CPU."""
 _STEP_COST, _STEP_COST_PER_GAUSSIAN = 0.022, 1e-6
-"""Processor time of a training step, s, and s per new Gaussian; measured in total: 0.03 to 0.04 s."""
+"""Processor time of a training step, s: constant part, and part per new Gaussian. Measured sum: 0.03 to 0.04 s."""
 _GROWTH = 1.4
-"""Ratio of the filled area, with gaps and stains, to the area of the hole; 1.5 for the koala and 1.4 for the fox."""
+"""Ratio of the filled area, which includes gaps and stains, to the area of the hole; koala 1.5, fox 1.4."""
 _HOLE_AREA, _HOLE_DEPTH = 0.6, 0.35
-"""Area and half width of a hole that is not known yet, as fractions of its bounding square and of the square's side."""
+"""Assumed area and half width of a hole that is not known yet, relative to area and side of its bounding square."""
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def inpaint_cost(hole: Hole | None, *, steps: int) -> float:
 
 
 def _training_time(new_count: float, steps: int) -> float:
-    """Return the expected processor time of ``steps`` of training ``new_count`` Gaussians, s."""
+    """Return the expected processor time of ``steps`` training steps of ``new_count`` new Gaussians, s."""
     return steps * (_STEP_COST + _STEP_COST_PER_GAUSSIAN * new_count)
 
 

@@ -40,7 +40,7 @@ class Inpainter(Protocol):
             hole: (H, W) bool, the pixels to fill.
             known: (H, W) bool, where ``image`` can be trusted outside the hole.
             shade: (H, W) bool, shaded pixels that should not be copied to lit places.
-            progress: Called with the finished fraction, if the method consists of several parts.
+            progress: Called with the finished fraction; not by methods of a single step.
 
         Returns:
             (H, W, 3) float32, 0 to 1, equal to ``image`` outside ``hole``.

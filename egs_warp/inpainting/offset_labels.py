@@ -42,8 +42,8 @@ _ALIKE = 0.05
 repeats there."""
 _FORBIDDEN = 50_000_000
 _PREPARED = 0.6
-"""Fraction of the processor time in which the costs of the offsets are computed; their choice takes the rest. Measured
-for the koala and the fox on a CPU: 0.55 and 0.7."""
+"""Fraction of the processor time that computing the costs of the offsets takes; choosing the offsets takes the rest.
+Measured on a CPU: 0.55 for the koala and 0.7 for the fox."""
 
 
 @dataclass(frozen=True)

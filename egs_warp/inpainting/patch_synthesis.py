@@ -24,7 +24,7 @@ from egs_warp.kernels.inpainting.patch_synthesis import RADIUS, search_kernel, v
 from egs_warp.launching import launch_rows, zeros
 
 _RIM_FACTOR = 1.4
-"""Number of targets at the coarsest level, relative to that of the hole's pixels."""
+"""Ratio of the number of targets to the number of pixels of the hole, at the coarsest level."""
 _COARSEST_HALF_WIDTH = 16.0
 """Half width, in pixels, of the hole at the coarsest level, where offsets are chosen."""
 _STRIDES = (8, 4, 2, 1, 8, 4, 2, 1)
@@ -39,10 +39,10 @@ sqrt(weight) pixels."""
 _STRICT_TOLERANCE = 0.25
 """Tolerance of the last vote at each level, smaller so that the result is as sharp as its sources."""
 _SEARCH_TIME = 16e-6
-"""Processor time of a search per target, s."""
+"""Processor time of one search per target, s."""
 _START_COST = 55.0
-"""Processor time per target of the choice of offsets at the coarsest level, relative to that of a search: 0.88 ms and
-16 us for the koala and the fox on a CPU."""
+"""Ratio of two processor times per target: of choosing the offsets at the coarsest level (0.88 ms on a CPU, measured
+for the koala and the fox) and of one search (16 us)."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,8 @@ def painting_time(pixels: float, depth: float, source_depth: float = math.inf) -
     Args:
         pixels: number of pixels of the hole.
         depth: half width of the hole, pixels.
-        source_depth: half width of the widest known part, pixels. Levels at which it is narrower than a patch are not
-            used.
+        source_depth: half width of the widest known part, pixels. Levels at which this part is narrower than a patch
+            are not used.
     """
     wanted = math.ceil(math.log2(max(depth, 1.0) / _COARSEST_HALF_WIDTH))
     usable = 30 if math.isinf(source_depth) else math.floor(math.log2(max(source_depth, 1.0) / (RADIUS + 1)))

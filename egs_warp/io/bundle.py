@@ -72,8 +72,7 @@ class BundleBody:
     cage: BundleCage | None = None
     """Cage of the splats; None for static splats, such as the rest of a scene."""
     normals: np.ndarray | None = None
-    """(n, 3) unit normals of the surface at rest, zero where there is none; None if the colours do not change with the
-    main light."""
+    """(n, 3) unit normals of the surface at rest, zero where there is no surface; None if the body is not relit."""
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,9 @@ _METHODS = (
     (zlib.Z_RLE, 3),
     (zlib.Z_HUFFMAN_ONLY, 5),
 )
-"""Strategies and memory levels of zlib; an array uses those with which it has the fewest bytes. Planes of noise are
-smallest without matches, and with codes that are renewed often."""
+"""Pairs of zlib strategy and memory level; each array is deflated with the pair that gives the fewest bytes. For byte
+planes that resemble noise, this is one without string matches and with a low memory level, which renews the Huffman
+codes often."""
 _MAX_RATIO = 1032
 """Maximum ratio of inflated to deflated bytes that RFC 1951 allows."""
 

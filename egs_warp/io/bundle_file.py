@@ -26,8 +26,7 @@ VERSION = 1
 HEAD = struct.Struct("<4sII")
 """Magic bytes, version, and length of the JSON text in bytes."""
 BYTE_ZERO = 128
-"""Stored value of a zero in the arrays that a player reads in their stored form: SH coefficients above band 0, and
-normals."""
+"""Byte that stands for zero in the arrays that a player does not decode: SH coefficients above band 0, and normals."""
 _ROUNDING = 1.0 + 1e-3
 """Maximum ratio of a stated error to half a step; above 1, because steps are rounded to double precision."""
 _INDICES = ("cage_tets", "surface", "tets", "carriers", "arm_tets")

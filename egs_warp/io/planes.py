@@ -165,7 +165,7 @@ def _ground_from_json(entry: Any, path: Path) -> HeightField:
 
 
 def light_to_json(light: MainLight) -> dict[str, Any]:
-    """Return the JSON object of a light, as ``plane.json``, bundles and pages store it."""
+    """Return a light as a JSON object, the form in which ``plane.json``, bundles and pages store it."""
     return {
         "direction": light.direction.tolist(),
         "half_angle": light.half_angle,

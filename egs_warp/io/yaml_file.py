@@ -1,5 +1,5 @@
-"""Reading of YAML files written by users: safe loading without aliases, and validation by a JSON schema whose errors
-name the line."""
+"""Reading of YAML files written by users: safe loading without aliases, and validation against a JSON schema, with the
+line of each mistake."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from egs_warp.io.text import read_text
 
 
 def read_yaml(path: Path) -> tuple[Any, Any]:
-    """Return the values of a YAML file and its tree of nodes, from which ``line_of`` finds lines.
+    """Return the values of a YAML file and its root node, which ``line_of`` needs to find lines.
 
-    Raises ``UserError`` if the file cannot be read or is not YAML, and for aliases and for keys that occur twice.
+    Raises ``UserError`` if the file cannot be read or is not YAML, or contains an alias or the same key twice.
     """
     import yaml
 
@@ -53,8 +53,10 @@ def read_yaml(path: Path) -> tuple[Any, Any]:
 
 
 def check_schema(path: Path, values: Any, node: Any, schema: str) -> None:
-    """Raise ``UserError`` for the first error of the ``values`` of a YAML file against a schema of the package
-    ``egs_warp.io``. The message names the line, the entry and the mistake."""
+    """Validate the ``values`` of a YAML file against a schema in the package ``egs_warp.io``.
+
+    Raises ``UserError`` for the first mistake, with its line and entry.
+    """
     errors = sorted(_validator(schema).iter_errors(values), key=lambda error: line_of(node, list(error.absolute_path)))
     if not errors:
         return
@@ -73,7 +75,7 @@ def check_schema(path: Path, values: Any, node: Any, schema: str) -> None:
 
 
 def line_of(node: Any, place: Sequence[str | int]) -> int:
-    """Return the line, from 1, of the entry at ``place``, the keys and indices that lead to it."""
+    """Return the line, counted from 1, of an entry. ``place`` contains the keys and indices that lead to it."""
     mark = None if node is None else node.start_mark
     for part in place:
         if node is None or not isinstance(node.value, list):

@@ -79,7 +79,7 @@ class LevelSet:
         return cls(np.asarray(origin, float), float(spacing), np.asarray(coefficients, np.float32))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the numbers; the cached structs and arrays of Warp cannot be pickled."""
+        """Pickle only the fields, because cached Warp structs and arrays cannot be pickled."""
         return LevelSet, (self.origin, self.spacing, self.coefficients)
 
     @cached_property
@@ -163,7 +163,7 @@ def level_set_of_body(solid: LatticeSolid, points: np.ndarray) -> LevelSet:
     vertices, faces, _, _ = measure.marching_cubes(shape, 0.0)
     vertices = origin + spacing * vertices.astype(np.float64)
     counts = np.array(inside.shape)
-    # The surface separates the nodes by the sign of ``shape``.
+    # Marching cubes puts the surface between nodes at which ``shape`` has different signs.
     return LevelSet.through(
         origin, spacing, _signed_distances(vertices, faces, origin, spacing, counts, inside=shape < 0.0)
     )
@@ -253,8 +253,8 @@ def _signed_distances(
     *,
     inside: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the distances (nx, ny, nz) m of lattice nodes from a closed surface, negative inside. ``inside`` (nx, ny,
-    nz) is the mask of the nodes inside; None finds them by the winding number of the surface."""
+    """Return the signed distances (nx, ny, nz) m of lattice nodes from a closed surface, negative inside. ``inside``
+    (nx, ny, nz) is True at the nodes inside; if it is None, the winding number of the surface decides."""
     device = wp.get_device("cpu")
     centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     with wp.ScopedDevice(device):

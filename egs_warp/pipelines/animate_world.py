@@ -44,15 +44,15 @@ class WorldReport:
     bodies: Mapping[str, Report]
     """Reports by the names of the bodies."""
     results: Mapping[str, str]
-    """One line on each body: what its motions reached, or how a prop has moved."""
+    """One line for each body: what a creature's motions reached, or how far a prop has moved."""
     stopped: bool
     """True if the run ended at a step that could not be solved."""
     film: str | None = None
-    """Name of the video in the folder of the run; None if it was not filmed."""
+    """Name of the video in the folder of the run; None if there is no film."""
     notes: tuple[str, ...] = ()
     """Notes for the user."""
     asked: Mapping[str, JsonValue] = field(default_factory=dict)
-    """Requested world, ready for JSON."""
+    """Contents of the world file, ready for JSON."""
 
     @property
     def state(self) -> State:
@@ -98,20 +98,20 @@ def write_world(
     asked: Mapping[str, JsonValue] | None = None,
     show_note: Callable[[str], object] = lambda note: None,
 ) -> WorldReport:
-    """Write the film of a simulated world, and the trajectory and the report of each body into a folder of its own.
+    """Write the film and the report of a simulated world, and for each body a folder with its trajectory and report.
 
     Args:
         run: The simulated world (``simulate``).
         out: Folder for the results.
-        film: False writes no film.
+        film: Write the film.
         shot: Camera, size, frame rate and background colour of the film.
         size: Width and height of the film, pixels, if ``shot`` has no size.
-        view_from: (3,) Direction to the camera in the axes of the world; None chooses it.
+        view_from: (3,) Direction to the camera in the axes of the world; None chooses it (``world_camera``).
         shadow: Draw the shadows of the bodies.
         overwrite: Move the files of an earlier run in ``out`` aside.
         quiet: Show no progress bar.
         notes: Notes for the report.
-        asked: Requested world for the report.
+        asked: Contents of the world file, for the report.
         show_note: Called with each note on a motion or a push that did not take place.
 
     Raises:

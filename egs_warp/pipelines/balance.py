@@ -26,8 +26,8 @@ _STAND_TIME = 6.0
 _MOTION = "stand 60"
 """Motion of the check, which the number of frames ends before it is complete."""
 _IMPULSE = 0.05
-"""Impulse of the push at the start, in units of m sqrt(g H). It tips a rigid body over an edge of its base that is
-within about 0.03 H of its centre of mass."""
+"""Impulse of the push at the start, in units of m sqrt(g H). It tips a rigid body over if its centre of mass is within
+about 0.03 H, measured horizontally, of an edge of its base."""
 
 
 def own_muscles_notes(cloud: GaussianCloud, standing: PlacedCage, facing: Front, muscles_file: Path) -> tuple[str, ...]:
@@ -47,8 +47,8 @@ def own_muscles_notes(cloud: GaussianCloud, standing: PlacedCage, facing: Front,
 def balance_note(creature: Creature) -> str | None:
     """Return a note for the user if ``creature`` falls over in a short stand; None if it stands.
 
-    At the start, it is pushed gently towards the nearest edge of its base. A body that stands even without muscles gets
-    no note.
+    At the start, it is pushed gently towards the nearest edge of its base. There is no note for a body that stands even
+    without muscles.
     """
     place = initial_stance(creature)
     if not has_upright_pose(place.base()):

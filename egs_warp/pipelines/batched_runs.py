@@ -1,7 +1,7 @@
 """Batched runs: simulation of many jobs at once, in one process on one device.
 
-Each job is a generator of the steps that it needs (``Job.steps``), and ``BatchStepper`` makes the steps of all jobs of
-a batch in lockstep.
+Each job is a generator of step requests (``Job.steps``), and ``BatchStepper`` computes the requested steps of all jobs
+of a batch in lockstep.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def choose_batch_size(creature: Creature, jobs: int) -> int:
 
 
 def is_batchable(creature: Creature, job: Job) -> bool:
-    """Return True if the job can run in a batch: its activations are prescribed, or they are planned by the strategy
-    and the QP solver of the batch."""
+    """Return True if the job can run in a batch: its activations are prescribed, or the creature's strategy and QP
+    solver can plan them in a batch."""
     settings = creature.stepper.settings
     return job.activations is not None or (
         Strategy(settings.strategy) is Strategy.MODES
@@ -71,14 +71,14 @@ def is_batchable(creature: Creature, job: Job) -> bool:
 
 
 Progress = Callable[[dict[int, tuple[int, int]]], object]
-"""Function that is called with the frames done and expected, by the number of each job that has advanced."""
+"""Function that is called with the finished and the expected frames of each job that has advanced, by job number."""
 
 
 def run_batched(
     creature: Creature, jobs: Sequence[tuple[int, Job]], *, worlds: int, progress: Progress
 ) -> Iterator[TaskResult]:
-    """Run jobs in batches and yield each result when its run ends. A batch contains only jobs of the same step size,
-    and either prescribed or planned activations.
+    """Run jobs in batches and yield each result when its run ends. All jobs of a batch have the same step size, and
+    their activations are either all prescribed or all planned.
 
     Args:
         creature: The creature of all jobs.
@@ -127,8 +127,8 @@ def _make_batch_job(creature: Creature, number: int, job: Job, _: ProgressCallba
 
 
 def _run_batch(creature: Creature, batch: Sequence[_BatchJob], progress: Progress) -> Iterator[TaskResult]:
-    """Run one batch and yield its results. If the memory does not suffice, run the rest of it as two smaller
-    batches."""
+    """Run one batch and yield its results. If the memory does not suffice, run the unfinished jobs in batches of half
+    the size."""
     import torch
 
     memory_error, finished = "", set[int]()
@@ -154,7 +154,7 @@ def _run_batch(creature: Creature, batch: Sequence[_BatchJob], progress: Progres
 
 @dataclass
 class _Run:
-    """A run of a batch: its world, its steps, and the step that it needs next."""
+    """The run of one job in a batch: its creature, its steps, and the step that it requests next."""
 
     one: _BatchJob
     creature: Creature
@@ -165,7 +165,7 @@ class _Run:
     """Report of the last step."""
 
     def resume(self, done: list[StepReport] | None, job: Job, _: ProgressCallback) -> RunSummary | None:
-        """Continue the run with the reports of its step, or begin it. Return the summary if the run has ended."""
+        """Continue the run with the reports of its step; None starts it. Return the summary if the run has ended."""
         self.last = done[-1] if done else None
         try:
             self.request = next(self.steps) if done is None else self.steps.send(done)
@@ -204,8 +204,8 @@ def _run(creature: Creature, batch: Sequence[_BatchJob], progress: Progress) -> 
 def _start_runs(
     creature: Creature, stepper: BatchStepper, batch: Sequence[_BatchJob], frames: dict[int, tuple[int, int]]
 ) -> list[_Run]:
-    """Prepare the runs of a batch: let the creature come to rest where its ground has another friction. The runs write
-    their finished and expected frames to ``frames``."""
+    """Prepare the runs of a batch. If a job has another friction, the creature first comes to rest on its ground. The
+    runs write their finished and expected frames to ``frames``, by job number."""
     starts, is_unsolvable = [creature.start] * len(batch), [False] * len(batch)
     # Without a friction of the job, the creature is already at rest.
     if any(one.job.friction is not None for one in batch):
@@ -225,21 +225,23 @@ def _start_runs(
 
 
 def _unsolvable() -> RunSteps[SimulatedRun]:
-    """Return the steps of a run whose creature cannot stand on its ground: they raise ``UnsolvableStepError``."""
+    """Return steps that raise ``UnsolvableStepError``, for a creature that cannot come to rest on its ground."""
     raise UnsolvableStepError(UNSOLVABLE)
     yield
 
 
 def _resumed(run: _Run, done: list[StepReport] | None) -> tuple[str, Any]:
-    """Continue ``run``; return ``done`` and its summary or None, or ``failed`` and the reason in one line."""
+    """Continue ``run``. Return "done" and its summary, None before its end; or "failed" and the reason in one line."""
     return run_task(partial(run.resume, done), run.one.job, _no_progress)
 
 
 def _advanced(
     stepper: BatchStepper, state: BatchState, runs: dict[int, _Run], done: dict[int, list[StepReport]]
 ) -> BatchState:
-    """Make the steps that the ``runs`` (by world) need, add their reports to ``done``, and return the state after them.
-    A run whose step cannot be solved has no reports; its world is removed from the state."""
+    """Compute the steps that the ``runs`` (by world) request, add their reports to ``done``, and return the new state.
+
+    A run whose step cannot be solved gets no reports, and its world is removed from the state.
+    """
     import torch
 
     worlds = state.worlds.tolist()
@@ -267,7 +269,7 @@ def _request(run: _Run) -> StepRequest:
 
 
 def _pushed_velocities(state: BatchState, requests: Sequence[tuple[_Run, StepRequest]]) -> torch.Tensor:
-    """Return the velocities (c, N, 3) m/s of ``state``, replaced where a run has pushed its body."""
+    """Return the velocities (c, N, 3) m/s of ``state``, with those of pushed bodies replaced."""
     velocities = state.velocities
     for row, (run, request) in enumerate(requests):
         before = run.creature.start if run.last is None else run.last.state

@@ -55,7 +55,7 @@ def bundle_of(run: FinishedRun, *, every: int = 1, degree: int | None = None, li
     steps = run.steps[chosen_frames(run, frame=None, every=every)]
     light = run.creature.light
     bodies = [_moving_body(run.deformer(), run.trajectory, steps, degree, has_normals=light is not None)]
-    # The player draws the shadow, also at rest.
+    # Without its shadow, because the player draws shadows itself.
     scene = run.scene_without_shadow()
     if scene is not None:
         bodies.append(BundleBody("scene", with_degree(scene, degree)))

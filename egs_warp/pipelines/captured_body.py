@@ -1,8 +1,8 @@
 """A captured object as a body of a simulation: its Gaussians, its stepper and its state at rest on the ground.
 
 ``Creature`` is a body with muscles, ``Prop`` a stiff body without muscles. ``CapturedBody.moved`` places a body
-anywhere on the ground: only the state moves. The rest shape, and all that is embedded in it (Gaussians, muscles,
-contact points, level set), stays in the frame of the cage, so that copies of a body share it.
+anywhere on the ground by moving only its state. The rest shape and all that is embedded in it (Gaussians, muscles,
+contact points, level set) stay in the frame of the cage, so that copies of a body share them.
 """
 
 from __future__ import annotations
@@ -64,12 +64,12 @@ class Placement:
     """(3,) m, translation after the rotation."""
 
     def then(self, turn: np.ndarray, shift: np.ndarray) -> Placement:
-        """Return the motion followed by the rotation ``turn`` (3, 3) and the translation ``shift`` (3,) m."""
+        """Return this motion followed by the rotation ``turn`` (3, 3) and the translation ``shift`` (3,) m."""
         return Placement(turn @ self.turn, turn @ self.shift + shift)
 
     def applied_to(self, state: BodyState) -> BodyState:
-        """Return a state in the frame of the cage, moved to the frame of the ground; it keeps its bits if the two are
-        equal."""
+        """Transform a state from the frame of the cage to the frame of the ground. The bits are unchanged if the two
+        frames are equal."""
         if np.array_equal(self.turn, np.eye(3)) and not self.shift.any():
             return state
         return replace(
@@ -110,7 +110,7 @@ class CapturedBody:
 
     def moved(self, at: tuple[float, float, float] = (0.0, 0.0, 0.0), heading: float = 0.0) -> Self:
         """Return the same body at rest elsewhere: turned about the vertical axis of the frame by ``heading`` degrees,
-        counter-clockwise seen from above, then moved by ``at``, m. Without a motion, it is this object."""
+        counter-clockwise seen from above, then moved by ``at``, m. If both are zero, return this object."""
         turn = Rotation.from_rotvec(np.radians(heading) * GROUND.normal).as_matrix()
         shift = np.asarray(at, float)
         if heading == 0.0 and not shift.any():

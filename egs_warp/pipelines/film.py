@@ -161,16 +161,16 @@ def encode_film(
     """Write the video ``name`` and ``sheet.png`` into the folder of ``run``.
 
     Args:
-        frames: The frames, which are rendered while they are written.
+        frames: The frames, rendered one by one as they are written.
         run: Folder for the files.
-        name: Name of the video, without its ending.
+        name: Name of the video, without the file ending.
         camera: Camera of the first frame.
         shot: Frame rate and transparency.
         time: (n,) s, time of each frame.
         quiet: Show no progress bar.
 
     Returns:
-        The path of the video, and the time of each frame by stage, ms.
+        The path of the video, and for each stage the computing time of each frame, ms.
     """
     milliseconds: dict[str, list[float]] = {"deform": [], "render": [], "encode": []}
     sheet_images: list[np.ndarray] = []
@@ -196,7 +196,7 @@ def encode_film(
 
 
 def split_deformer(performance: BodyResult, *, in_scene: bool = False) -> Deformer:
-    """Return the deformer of the Gaussians of a body, split for its motion. A prop moves affinely, so it is not split.
+    """Return the deformer of the Gaussians of a body, split for its motion. Props move affinely and are not split.
 
     Args:
         performance: The simulated body.
@@ -249,10 +249,10 @@ def drawn_frames(
 
 @dataclass(frozen=True)
 class Filmed:
-    """Extent of a filmed motion, from which its ground and shadow follow."""
+    """Extent of a filmed motion, which defines the extent of the drawn ground and shadow."""
 
     path: np.ndarray
-    """(n, 3) m, centres of mass of the bodies over the motion."""
+    """(n, 3) m, centres of mass of all bodies at all times."""
     height: float
     """Height of the highest body, m."""
     is_flat: bool = True

@@ -58,8 +58,8 @@ class Job:
     def steps(
         self, creature: Creature, *, progress: Callable[[int, int], object] = lambda done, expected: None
     ) -> RunSteps[SimulatedRun]:
-        """Return the steps of the simulation of a ``creature`` that already stands on ground with the job's
-        friction."""
+        """Return a generator of the solver steps (``simulation_steps``) of a ``creature`` that already stands on ground
+        with the job's friction."""
         options = {
             name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("motion", "friction")
         }

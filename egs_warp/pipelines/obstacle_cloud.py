@@ -21,13 +21,13 @@ _SAMPLES = 120
 _WIDTH, _THICKNESS, _LOGIT = 0.62, 0.1, 3.0
 """Standard deviations of a Gaussian along and across its face, in sample spacings, and the logit of its opacity."""
 _COLOUR = np.array([0.60, 0.62, 0.66])
-"""sRGB colour of a face that looks up."""
+"""sRGB colour of a face that faces the light."""
 _LIGHT = np.array([0.35, -0.45, 0.82])
 """Direction to the light that shades the faces."""
 _MIN_UPWARD = 0.3
-"""Vertical component of the normal of a face above which bodies cast contact shadows on it."""
+"""Minimum vertical component of the normal of a face on which bodies cast contact shadows."""
 _AMBIENT = 0.62
-"""Brightness of a face in the shade, relative to a face that looks at the light."""
+"""Brightness of a face in the shade, relative to a face that faces the light."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,12 @@ class Obstacles:
 
 
 def make_obstacles(solids: Sequence[Solid], low: np.ndarray, high: np.ndarray, *, device: str) -> Obstacles | None:
-    """Return opaque grey surfaces of the solids; None if there is nothing to draw. Walls that consist of a single face
-    are not drawn, because they would hide the bodies.
+    """Return opaque grey surfaces of the solids; None if there is nothing to draw. Solids with a single face, such as
+    walls, are not drawn, because they would hide the bodies.
 
     Args:
         solids: Obstacles in the frame of the world, m.
-        low, high: (3,) m, corners of the box within which unbounded solids are drawn.
+        low, high: (3,) m, corners of the box outside which nothing is drawn.
         device: Warp device.
     """
     parts = [part for solid in solids if len(solid.faces) > 1 for part in _faces(solid, low, high)]
@@ -82,7 +82,7 @@ class ObstacleShadows:
 
         Args:
             obstacles: The obstacles.
-            first: Number of Gaussians of the bodies, which precede those of the obstacles in the joint cloud.
+            first: Index of the first Gaussian of the obstacles in the joint cloud, after those of the bodies.
             blur_radius: Blur radius of the bodies (``shadow_blur_radius``), m.
             height: Height of the highest body, m.
         """
@@ -100,7 +100,7 @@ class ObstacleShadows:
             self._receivers.append((shadow, rows, texels, wp.full(len(points), 1.0, dtype=wp.float32, device=device)))
 
     def draw(self, joint: GaussianCloud) -> None:
-        """Darken the Gaussians of the obstacles in the ``joint`` cloud by the shadows of its bodies."""
+        """Darken the Gaussians of the obstacles in the ``joint`` cloud where the bodies cast shadows."""
         if not self._receivers:
             return
         first = self._first
@@ -157,8 +157,8 @@ def _on_edge(points: np.ndarray, face: Plane, other: Plane, spacing: float) -> n
 
 
 def _extent(solid: Solid, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the corners of the box around the part of a solid above the ground that lies within the box from ``low``
-    to ``high``; None if it has no volume there. Accurate to a hundredth of the box."""
+    """Return the corners of the box around the part of a solid that is within the box from ``low`` to ``high``; None if
+    that part has no volume. The error is at most a hundredth of the size of the box."""
     axes = [np.linspace(a, b, 101) for a, b in zip(low, high, strict=True)]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     inside = np.all([face.heights(lattice) <= 0.0 for face in solid.faces], axis=0)

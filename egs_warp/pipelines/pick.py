@@ -27,11 +27,11 @@ from egs_warp.segmentation.plane_search import find_planes
 from egs_warp.segmentation.table_top import planes_below, surface_around
 
 _MAX_TILT, _MAX_TILT_OF_CAMERAS = 25.0, 10.0
-"""Maximum tilt of a ground relative to an up direction, and to one that follows from cameras, degrees, as in
-``locate_plane``."""
+"""Maximum angle between the normal of the ground and the up direction, degrees: without cameras, and with an up
+direction from cameras; as in ``locate_plane``."""
 _MAX_OUTSIDE = 0.02
-"""Share of the opaque Gaussians, averaged over the photos, that may lie outside the frames of a capture that contains
-only one object. It is 0 to 0.003 for an object on a white desk or a turntable, and 0.29 to 0.65 for rooms."""
+"""Share of the opaque Gaussians outside the frame of a photo, averaged over the photos, below which the capture is one
+object. It is 0 to 0.003 for an object on a white desk or a turntable, and 0.29 to 0.65 for rooms."""
 _MIN_SUPPORT = 0.15
 """Minimum share of the visible surface on the widest plane for it to be the ground of a scene."""
 _MAX_BELOW = 0.3
@@ -49,7 +49,7 @@ _MAX_EXTENT = 0.6
 _VIEWS, _SIDE = 6, 160
 """Number of pictures in which an object is tested, and their longer side in pixels."""
 _MIN_COVERED = 0.01
-"""Fraction of a picture that an object covers, below which it is reported as small: photographers fill the picture."""
+"""Minimum fraction of a photo that a whole object covers, because photographers fill the picture."""
 _SEED_COUNT = 8
 """Number of Gaussians nearest to the middle of a scene from which the proposal starts."""
 _OPAQUE = 0.3
@@ -72,7 +72,7 @@ class Pick:
     proposal: np.ndarray | None = None
     """(n,) bool, initial selection that the clicks change, from a file or a proposal; None for an empty one."""
     outside: np.ndarray | None = None
-    """(n,) share of the photos whose frame does not contain a Gaussian; None if it is unknown."""
+    """(n,) for each Gaussian, the share of the photos whose frames do not contain it; None if it is unknown."""
     is_alone: bool = False
     """True if the photos show that the capture contains nothing else."""
     is_guess: bool = False
@@ -221,14 +221,14 @@ def on_table_top(graph: ClickGraph, pick: Pick) -> Pick:
 def proposed(graph: ClickGraph, up: np.ndarray, *, cameras: Sequence[Camera] = ()) -> Pick:
     """Return the proposal without any clicks: the ground and the object in the middle.
 
-    A capture without a wide plane under it, and one whose opaque Gaussians are in the frames of all photos, is
-    considered one object on its base: photos of a room show surroundings that other photos do not show.
+    A capture is considered one object on its base if there is no wide plane under it, or if its opaque Gaussians are in
+    the frames of nearly all photos: each photo of a room shows surroundings that other photos do not show.
 
     Args:
         graph: the prepared capture.
         up: (3,) up direction.
-        cameras: cameras of the capture, in the frame of ``graph``. The object is what they look at and what their
-            pictures contain; without them, it is in the middle of what stands on the ground.
+        cameras: cameras of the photos, in the frame of ``graph``. The object is what they look at and keep in their
+            frames. Without cameras, it is in the middle of what stands on the ground.
     """
     cloud, opaque = graph.cloud, graph.cloud.opacities() > _OPAQUE
     middle = looked_at(cameras)
@@ -250,20 +250,20 @@ def proposed(graph: ClickGraph, up: np.ndarray, *, cameras: Sequence[Camera] = (
     if _is_large(graph, guess):
         # Half of a room is a bad proposal.
         return empty
-    # The user's clicks may select something else, which the photos frame differently.
+    # The user's clicks may select another object, which the photos do not keep in their frames.
     return replace(guess, clicks=(), outside=None, proposal=guess.mask, is_guess=True)
 
 
 def _is_alone(cloud: GaussianCloud, outside: np.ndarray | None) -> bool:
-    """Return True if the frames show that the capture contains only one object. ``outside`` (n,) is the share of the
-    photos whose frame does not contain a Gaussian; None if it is unknown."""
+    """Return True if the frames of the photos show that the capture contains only one object. ``outside`` is described
+    at ``Pick``."""
     solid = cloud.opacities() >= MIN_OPACITY
     return outside is not None and bool(solid.any()) and float(outside[solid].mean()) < _MAX_OUTSIDE
 
 
 def _wide_plane(graph: ClickGraph, up: np.ndarray, opaque: np.ndarray, middle: np.ndarray | None) -> Plane | None:
-    """Return the widest plane that can be the ground of a scene, below ``middle`` (3,) if that is known; None if there
-    is none."""
+    """Return the widest plane that can be the ground of a scene, and that is below ``middle`` (3,) if this is known;
+    None if there is no such plane."""
     for one in find_planes(graph.cloud, up, tilt_degrees=_MAX_TILT if middle is None else _MAX_TILT_OF_CAMERAS):
         if one.support <= _MIN_SUPPORT or not opaque.any():
             return None
@@ -312,7 +312,7 @@ def _is_large(graph: ClickGraph, pick: Pick) -> bool:
 
 
 def pick_warnings(graph: ClickGraph, pick: Pick) -> tuple[str, ...]:
-    """Return warnings about an object, each with a remedy. The size of the only object of a capture is no warning."""
+    """Return warnings about an object, each with a remedy. An object that is alone in its capture may be large."""
     count = int(pick.mask.sum())
     if count == 0:
         return ()
@@ -332,7 +332,7 @@ def pick_warnings(graph: ClickGraph, pick: Pick) -> tuple[str, ...]:
 
 def photo_warnings(cloud: GaussianCloud, mask: np.ndarray, cameras: Sequence[Camera]) -> tuple[str, ...]:
     """Return a warning with a remedy if the object ``mask`` (n,) bool of ``cloud`` touches nearly all edges of a
-    picture, as a room does, or covers hardly any of the pictures, as a fragment does."""
+    picture, as a room does, or covers only a very small part of the pictures, as a fragment does."""
     tested = [downscale(camera, _SIDE) for camera in cameras[:: max(1, len(cameras) // _VIEWS)]][:_VIEWS]
     if not tested or not mask.any():
         return ()

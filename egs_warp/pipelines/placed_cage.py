@@ -1,4 +1,4 @@
-"""The placement of a captured body: its frame on the ground, its cage in this frame, and its facing direction."""
+"""Placement of a captured body: its frame on the ground, its cage in this frame, and its facing direction."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def place_cage(
 
     Args:
         cloud: The capture.
-        up: (3,) Up in the capture; if there is no ``plane``, the ground is the object's base, orthogonal to ``up``.
+        up: (3,) Up direction in the capture; without a ``plane``, the ground is the object's base, orthogonal to it.
         plane: Ground plane in the capture.
         metres_per_unit: Length of one unit of the capture, m; None uses ``height``.
         height: Height of the body, m; None makes it 1 m tall.
@@ -168,7 +168,7 @@ def check_front(up: np.ndarray, front: np.ndarray) -> None:
 
 
 def check_height(height: float | None, metres_per_unit: float | None) -> None:
-    """Raise ``ArgumentError`` for an invalid ``height`` of a body in metres, or one beside ``metres_per_unit``."""
+    """Raise ``ArgumentError`` if ``height`` (m) is outside its limits, or given together with ``metres_per_unit``."""
     if height is None:
         return
     if metres_per_unit is not None:

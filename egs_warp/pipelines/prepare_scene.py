@@ -46,7 +46,7 @@ _CLEARED = {
 _SOLID = 0.1
 """Minimum opacity of Gaussians that define the lowest part of an object."""
 _TRAINED = 0.6
-"""Finished fraction of the stage "segment" after the training at the plane; the light is estimated in the rest."""
+"""Finished fraction of the stage "segment" after the training at the plane, before the light is estimated."""
 _HOVER_FRACTION = 0.03
 """Distance from the plane above which an object hovers, as a fraction of the object's size."""
 
@@ -160,8 +160,8 @@ def prepare_scene(
         plane: The ground plane; None finds it.
         options: Options; None uses the default.
         progress: Called with the name of a stage and its finished fraction.
-        expect_costs: Called with the expected processor time of all stages (``SceneOptions.costs``) when the sizes of
-            object and hole are known.
+        expect_costs: Called with the expected processor times of all stages (``SceneOptions.costs``) as soon as the
+            sizes of the object and of the hole are known.
 
     Raises:
         UserError: A stage failed.

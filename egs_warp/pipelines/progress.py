@@ -37,8 +37,8 @@ _MIN_LEFT = 0.3
 """Minimum remaining time of a stage, as a fraction of its elapsed time, because a stage that takes longer than usual is
 not about to end."""
 _RELIABLE_FRACTION = 0.1
-"""Fraction of a stage, finished since its first report, from which its own speed, not its usual share, defines its
-remaining time."""
+"""Fraction of a stage that must be finished after its first report before its own speed, not its expected share,
+defines its remaining time."""
 _UPDATE_INTERVAL, _LOG_INTERVAL = 0.25, 10.0
 """Intervals between two updates of ``photos_bar``, s: on a terminal, and in a log."""
 _outer: ContextVar[PhotosBar | None] = ContextVar("_outer", default=None)
@@ -107,8 +107,8 @@ def conversion_bar(name: str, *, quiet: bool = False, file: TextIO | None = None
 def scene_bar(costs: Mapping[str, float], *, quiet: bool = False, file: TextIO | None = None) -> Iterator[StageBar]:
     """Show a bar on ``file`` (default stderr) for ``prepare_scene``.
 
-    ``costs`` is the value of ``SceneOptions.costs``. The methods ``update`` and ``expect`` of the yielded bar are the
-    arguments ``progress`` and ``expect_costs`` of ``prepare_scene``.
+    ``costs`` is the result of ``SceneOptions.costs``. Pass the methods ``update`` and ``expect`` of the yielded bar to
+    ``prepare_scene`` as its arguments ``progress`` and ``expect_costs``.
     """
     with StageBar("scene", costs, quiet=quiet, file=file) as bar:
         yield bar
@@ -232,7 +232,7 @@ class StageBar:
         self._total = sum(self._shares.values())
 
     def expect(self, shares: Mapping[str, float]) -> None:
-        """Replace the expected shares of the stages by better ones."""
+        """Replace the expected shares of the stages with better estimates."""
         self._shares = dict(shares)
         self.skip(())
 
@@ -255,9 +255,9 @@ class StageBar:
     def _left(self, elapsed: float) -> float | None:
         """Return the remaining time, s, ``elapsed`` seconds after the start; None before it can be estimated.
 
-        The time per share is measured in the earlier stages, or in the current one since its first report, because the
-        first step may include an import. A stage that takes longer than its share is expected to continue for some
-        time.
+        The time per share is measured in the earlier stages, or in the current stage after its first report, because
+        the time before that report may include an import. A stage that takes longer than its share is expected to
+        continue for some time.
         """
         share, start = self._shares.get(self._stage, 0.0), self._starts.get(self._stage, self._total)
         spent = elapsed - self._stage_start

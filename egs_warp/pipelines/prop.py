@@ -30,7 +30,7 @@ MIN_DENSITY, MAX_DENSITY = 1.0, 30_000.0
 _CAGE_NODES = 250
 """Approximate number of nodes of the cage in which the contact points of a prop are found."""
 _CONTACT_GRID = 2.0**-10
-"""Fraction of the height to which contact points are rounded, as for a creature."""
+"""Rounding step of contact points, as a fraction of the height; the same as for a creature."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -108,7 +108,7 @@ def _height(shape: CapturedShape) -> float:
 
 
 def embedded_in(mesh: TetMesh, geometry: ContactGeometry) -> ContactGeometry:
-    """Return all contact points of ``geometry`` in a ``mesh`` of one tetrahedron, which extrapolates exactly."""
+    """Embed all contact points of ``geometry`` in a ``mesh`` of one tetrahedron, also those outside it."""
     points = points_at_rest(geometry)
     corners = np.vstack([mesh.nodes[mesh.tets[0]].T, np.ones(4)])
     weights = np.linalg.solve(corners, np.vstack([points.T, np.ones(len(points))])).T

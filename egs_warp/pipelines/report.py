@@ -362,7 +362,7 @@ def report_of_run(
     """Create the report of a run.
 
     Args:
-        creature: The creature, or a prop.
+        creature: The creature or the prop.
         trajectory: All states of the run.
         steps: Reports of all steps.
         frames: (n,) indices of the trajectory's states.

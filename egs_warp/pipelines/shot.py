@@ -50,7 +50,7 @@ class CameraMove(StrEnum):
 
 
 class FilmedMotion(Protocol):
-    """Node positions that a camera films: a ``Trajectory``, or the bodies of a world."""
+    """Motion that a camera films: a ``Trajectory``, or the motion of all bodies of a world (``WorldMotion``)."""
 
     @property
     def time(self) -> np.ndarray:
@@ -64,7 +64,7 @@ class FilmedMotion(Protocol):
 
     @property
     def node_mass(self) -> np.ndarray:
-        """(N,) kg."""
+        """(N,) kg, nodal masses."""
         ...
 
     @property

@@ -62,7 +62,7 @@ _OCCLUSION_DISTANCE = 2.5
 
 
 class BodyResult(Protocol):
-    """Result of one body of a run: ``SimulatedRun`` of a creature, ``PropRun`` of a prop in a world."""
+    """Result of one body of a run: a ``SimulatedRun`` for a creature, a ``PropRun`` for a prop."""
 
     @property
     def body(self) -> CapturedBody:
@@ -279,8 +279,8 @@ class Performer:
         return max(done, self._remaining.frames(done, finished=self.watch.is_finished))
 
     def result(self, simulation: RolloutResult, *, has_frame_count: bool | None = None) -> SimulatedRun:
-        """Return the result of the run. ``has_frame_count`` is True if its end was requested; None decides it by
-        ``frames``."""
+        """Return the result of the run. ``has_frame_count`` is True if the number of frames was prescribed; None uses
+        True if ``frames`` was given."""
         trajectory = simulation.trajectory
         trajectory = trajectory.with_plan(planned_com(self.sequence, self.creature.body, trajectory))
         simulation = replace(simulation, trajectory=trajectory)
@@ -364,7 +364,7 @@ def simulation_steps(
     resume: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
 ) -> RunSteps[SimulatedRun]:
-    """Return the steps of ``simulate``, with the same arguments, and at the end its result."""
+    """Yield the steps of ``simulate``, which has the same arguments, and return its result at the end."""
     check_frames(frames)
     if activations is not None:
         activations = checked_activations(creature, activations, step)

@@ -76,20 +76,20 @@ def simulate(
 
     Args:
         creature: The creature at rest, or the world.
-        motion: The motion or motions, as a script or as its text (``egs_warp.motions.script``); for a world, one of
-            these for each body, by body or by name.
+        motion: The motion or motions, as a script or as its text (``egs_warp.motions.script``); for a world, a mapping
+            from creatures or their names to motions.
         frames: Number of frames at 60 Hz, the first at rest; None runs until the bodies have come to rest or fallen, or
             the time limit is reached.
-        max_seconds: Time limit of each motion, s; None uses the motion's own limit.
+        max_seconds: Time limit of the script of each creature, s; None uses the script's own limit.
         step: Maximum step size, s; None uses the default.
         style: Style of jumps; None uses the default.
-        pushes: Pushes during the run; for a world, the pushes on each body, by body or by name.
-        get_up: If a body falls, get up and continue.
-        ends_at_fall: If the body falls, end the run at the step at which the fall is detected; for one creature.
+        pushes: Pushes during the run; for a world, a mapping from creatures or their names to pushes.
+        get_up: If a creature falls, it tries to get up and continue.
+        ends_at_fall: End the run at the step at which a fall is detected; not for a world.
         activations: (steps, M) m, prescribed muscle activations of each solver step. The motion then only defines the
-            measured values, and the run ends with the last row; for one creature.
-        parts: Function that returns the folder for the finished steps, for one creature; None writes none.
-        resume: Folder with the finished steps of an interrupted run to continue; for one creature.
+            measured values, and the run ends with the last row; not for a world.
+        parts: Function that returns the folder for the finished steps; None writes none. Not for a world.
+        resume: Folder with the finished steps of an interrupted run to continue; not for a world.
         progress: Called after each frame with the number of finished frames and the number expected in total.
 
     Raises:

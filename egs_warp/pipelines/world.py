@@ -21,9 +21,9 @@ from egs_warp.pipelines.prop import Prop
 from egs_warp.short_repr import short_repr
 
 _MAX_OVERLAP = 0.005
-"""Depth, in heights of the lower body, up to which bodies may overlap at the start."""
+"""Depth up to which bodies may overlap at the start, in heights of the shorter body."""
 _MAX_DEPTH = 0.01
-"""Depth in an obstacle, in body heights, up to which a body may be placed."""
+"""Depth up to which a body may be inside an obstacle or the ground at the start, in body heights."""
 _MAX_POSITION = 1e4
 """Maximum coordinate of a place, m."""
 BodyKey = TypeVar("BodyKey", bound="PlacedBody | str")
@@ -54,7 +54,8 @@ class World:
 
         Args:
             solids: Steps, ramps and walls in addition to the ground, in the frame of the world.
-            friction: Coulomb coefficient of the ground and between bodies; None keeps the one of each body.
+            friction: Coulomb coefficient of the ground and between bodies; None keeps the coefficient of each body,
+                and uses the geometric mean of two coefficients between bodies.
 
         Raises:
             UserError: The friction is invalid.
@@ -91,10 +92,11 @@ class World:
             name: Name for messages and files; None numbers the bodies: ``creature-1``, ``prop-2``.
 
         Returns:
-            The placed body by which ``simulate`` and its result name the body.
+            The placed body, its key in the arguments of ``simulate`` and in the result.
 
         Raises:
-            UserError: The name is taken, the body has its own terrain, or it overlaps a solid or another body.
+            UserError: The name or the position is invalid, the name is taken, the ground of the body is not a level
+                plane, or the body overlaps a solid or another body.
         """
         kind = "prop" if isinstance(body, Prop) else "creature"
         name = f"{kind}-{len(self._members) + 1}" if name is None else name
@@ -127,8 +129,10 @@ class World:
         return self._members[name]
 
     def by_name(self, values: Mapping[BodyKey, Value], what: str) -> dict[str, Value]:
-        """Return ``values`` by the names of the bodies. Raises ``UserError``, which names ``what`` is given, for a
-        body that is not in the world."""
+        """Return ``values`` with the names of the bodies as keys.
+
+        Raises ``UserError`` for a body that is not in the world; its message calls the value ``what``.
+        """
         named: dict[str, Value] = {}
         for key, value in values.items():
             name = key if isinstance(key, str) else key.name
@@ -154,7 +158,7 @@ class World:
             raise ArgumentError("name", "another body of the world has this name; choose another one", value=repr(name))
 
     def _own_stepper(self, body: CapturedBody) -> LocomotionStepper:
-        """Return the stepper of ``body`` on the ground of the world. Bodies do not share steppers, which have
+        """Return a stepper of ``body`` on the ground of the world. No two bodies share a stepper, because a stepper has
         buffers."""
         old = body.stepper
         if self.solids:
@@ -169,7 +173,7 @@ class World:
         return deepcopy(old) if is_taken else old
 
     def _check_place(self, member: PlacedBody) -> None:
-        """Raise ``UserError`` if a body is inside a solid of the world."""
+        """Raise ``UserError`` if a body is inside a solid of the world or the ground."""
         body = member.body
         detector: ContactDetector = body.stepper.detector
         gaps, faces = detector.gaps(body.start.positions)
@@ -192,7 +196,7 @@ def check_apart(first: PlacedBody, second: PlacedBody) -> None:
 
 
 def _depth(body: CapturedBody, other: CapturedBody) -> float:
-    """Return the depth in metres of the deepest contact point of ``body`` in ``other``; 0 if their boxes are apart."""
+    """Return the depth (m) of the deepest contact point of ``body`` in ``other``; 0 if their boxes do not overlap."""
     points, theirs = _contact_points(body), _contact_points(other)
     if (points.min(axis=0) > theirs.max(axis=0)).any() or (theirs.min(axis=0) > points.max(axis=0)).any():
         return 0.0

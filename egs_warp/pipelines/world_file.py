@@ -1,4 +1,4 @@
-"""World files: captures, places, motions and obstacles of a world in YAML (docs/guide/worlds.md)."""
+"""World files: captures, positions, motions and obstacles of a world in YAML (docs/guide/worlds.md)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MAKER_KEYS = ("capture", "prop", "up", "front", "plane", "metres_per_unit", "he
 
 @dataclass(frozen=True)
 class WorldScript:
-    """A world, and what its creatures do, as a world file describes them."""
+    """Contents of a world file: a world, and the motions of its creatures and the pushes on them."""
 
     __repr__ = short_repr
 
@@ -40,7 +40,7 @@ class WorldScript:
     motions: Mapping[str, str]
     """Motions by the names of the creatures, as text; creatures without a motion stand."""
     pushes: Mapping[str, tuple[Push, ...]]
-    """Pushes by the names of the creatures."""
+    """Pushes on the creatures, by their names."""
     notes: tuple[str, ...]
     """Guesses about the captures, for the user."""
     text: Mapping[str, Any]
@@ -58,10 +58,10 @@ def read_world(
     Args:
         path: YAML file; names of captures are relative to its folder.
         device: Warp device; None uses Warp's current device.
-        progress: Called with the name of each body before it is created.
+        progress: Called with the name of each body before it is created; not for copies of an earlier body.
 
     Raises:
-        UserError: The file is invalid, with the line of the mistake, or a body cannot be created or placed.
+        UserError: The file is invalid, or a body cannot be created or placed; the message names the line.
     """
     path = Path(path)
     tree, node = read_yaml(path)
@@ -184,7 +184,7 @@ def _make_body(folder: Path, entry: Mapping[str, Any], device: str | None) -> Cr
 
 
 def _unused_name(world: World, name: str) -> str:
-    """Return ``name`` without characters that names cannot have, with a number if a body of the world has it."""
+    """Return ``name`` with ``-`` for characters that names cannot have, and with a number if it is already taken."""
     base = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in name)
     names = {placed.name for placed in world.members}
     number = 1

@@ -28,15 +28,15 @@ _ELEVATION = 0.35
 """Ratio of the vertical to the horizontal component of the direction to the camera, higher than for one body so that
 the ground between the bodies is visible."""
 _VIEWS = 24
-"""Number of directions that are compared."""
+"""Number of directions to the camera that are compared."""
 _LEVEL_WEIGHT = 0.4
-"""Weight of equal distances from the camera; with different distances, bodies of the same size look different."""
+"""Weight of equal distances from the camera: at different distances, bodies of equal size appear unequal."""
 _FRAMED_MARGIN = 0.15
 """Distance from the bodies up to which obstacles are in the picture, relative to the extent of the motion."""
 _OBSTACLE_MARGIN = 1.0
 """Distance from the bodies up to which obstacles are drawn, relative to the extent of the motion."""
 _FACING_WEIGHT = 0.6
-"""Weight of the faces relative to the separation of the bodies in the choice of the view."""
+"""Weight of creatures that face the camera, relative to that of bodies that do not hide each other."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class WorldMotion:
     time: np.ndarray
     """(n,) s, time of each frame."""
     positions: np.ndarray
-    """(n, N, 3) m, points of all bodies, one body after the other: nodes of a creature, extreme points of a prop."""
+    """(n, N, 3) m, points of all bodies, body after body: nodes of a creature, extreme contact points of a prop."""
     node_mass: np.ndarray
-    """(N,) kg, an equal part of the mass of its body for each point."""
+    """(N,) kg, mass of each point; the points of a body share its mass equally."""
     capture_frame: BodyFrame
-    """Frame of the world: cameras from a file are in metres and in the axes of the world."""
+    """Frame of the world, without scaling, because cameras from a file are in metres and in the axes of the world."""
 
     @classmethod
     def from_run(cls, run: WorldRun) -> WorldMotion:
@@ -78,8 +78,8 @@ class WorldFilm:
 
 
 def _outline(result: BodyResult) -> np.ndarray:
-    """Return points (n, N, 3) m of a body in each frame. The nodes of a prop are not near its surface, so extreme
-    points of its surface are returned instead."""
+    """Return points (n, N, 3) m that bound a body in each frame: the nodes of a creature. The nodes of a prop are not
+    near its surface, so its extreme contact points are returned instead."""
     body, simulation = result.body, result.simulation
     positions = simulation.trajectory.positions[simulation.frames]
     if len(body.mesh.tets) > 1:
@@ -92,7 +92,7 @@ def _outline(result: BodyResult) -> np.ndarray:
 def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | np.ndarray | None = None) -> Camera:
     """Return a fixed camera that shows all bodies, and obstacles near them, during the whole run.
 
-    By default it looks from the direction in which the bodies hide each other least and the creatures face the camera.
+    By default, the camera is where the bodies hide each other least and the creatures face it.
 
     Args:
         run: The simulated world.
@@ -137,11 +137,11 @@ def draw_world_film(
     Args:
         run: The simulated world.
         folder: Folder for the files.
-        name: Name of the video, without its ending.
+        name: Name of the video, without the file ending.
         size: Width and height of the video, pixels, if ``shot`` has no size.
         shot: Camera, size, frame rate and background colour.
         view_from: (3,) Direction to the camera in the axes of the world; None chooses it (``world_camera``).
-        shadow: Draw the shadows of the bodies on the ground.
+        shadow: Draw the shadows of the bodies on the ground and on obstacles.
         quiet: Show no progress bar.
     """
     shot = shot or Shot()
@@ -178,7 +178,7 @@ def _deform_with_shadows(
 
 
 def _obstacles(run: WorldRun, points: np.ndarray) -> Obstacles | None:
-    """Return the obstacles around ``points`` (n, 3) of the bodies; None if there are no obstacles."""
+    """Return the obstacles near the ``points`` (n, 3) of the bodies; None if there are none to draw."""
     low, high = points.min(axis=0), points.max(axis=0)
     margin = _OBSTACLE_MARGIN * float((high - low).max())
     device = str(run.results[0].body.cloud.device)
@@ -186,7 +186,7 @@ def _obstacles(run: WorldRun, points: np.ndarray) -> Obstacles | None:
 
 
 def _clearest_view(run: WorldRun) -> np.ndarray:
-    """Return the direction (3,) to the camera in which the bodies are separate and the creatures face the camera."""
+    """Return the direction (3,) to the camera from which the bodies look most separate and the creatures face it."""
     simulations = [result.simulation for result in run.results]
     paths = np.stack([path_of(each.trajectory)[each.frames][:, :2] for each in simulations])
     radii = [0.5 * float(np.ptp(each.trajectory.positions[0][:, :2], axis=0).max()) for each in simulations]

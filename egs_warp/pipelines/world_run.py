@@ -31,9 +31,9 @@ from egs_warp.short_repr import short_repr
 
 OtherKey = TypeVar("OtherKey", bound=PlacedBody | str)
 STANDING = "stand"
-"""Motion of a creature without one."""
+"""Motion of a creature for which no motion is given."""
 _PROP_TIME = 10.0
-"""Time limit of a world of props, s, and time after the last motion in which props may come to rest."""
+"""Time that props have to come to rest, s: after the time limit of the last motion, or in total without creatures."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class WorldRun:
 
     world: World
     bodies: Mapping[str, SimulatedRun | PropRun]
-    """Results by the names of the bodies, in the order in which these were added."""
+    """Results by the names of the bodies, in the order in which the bodies were added."""
 
     def __repr__(self) -> str:
         return f"WorldRun({', '.join(f'{name}: {run!r}' for name, run in self.bodies.items())})"
@@ -105,7 +105,7 @@ class WorldRun:
 
 
 class PassiveMotion:
-    """Motion of a prop: it has no objectives. Detects when the prop is at rest."""
+    """Motion of a prop: it has no objectives and detects when the prop is at rest."""
 
     def __init__(self, prop: Prop) -> None:
         self._rest = RestDetector(prop.body)
@@ -147,7 +147,7 @@ def simulate_world(
     index = {member.name: number for number, member in enumerate(world.members)}
 
     def others(name: str) -> dict[str, OtherBody]:
-        """Return the other bodies as the creature ``name`` sees them."""
+        """Return the bodies other than the creature ``name``, with their current states."""
         return {
             member.name: OtherBody(member.body.body, partial(_state_of, member, runs, index[member.name]))
             for member in world.members
@@ -201,12 +201,12 @@ def simulate_world(
 
 
 def _script(motion: Script | str, body: Creature, others: Mapping[str, OtherBody], dt: float) -> Script:
-    """Return the script of a creature; its text may name ``others``."""
+    """Return the script of a creature; its motions may be directed towards ``others``."""
     if isinstance(motion, Script):
         return motion
     return script_among(motion, others, initial_stance(body, step=dt))
 
 
 def _state_of(member: PlacedBody, runs: Sequence[BodyRun], index: int) -> BodyState:
-    """Return the current state of a body, whose run may not exist yet."""
+    """Return the current state of a body, or its start if it does not have a run yet."""
     return runs[index].state if index < len(runs) else member.body.start

@@ -17,8 +17,8 @@ from egs_warp.segmentation.object_spec import ObjectSpec
 _MIN_PHOTOS, _MAX_PHOTOS = 8, 32
 """Number of photos below which framing gives no information, and number above which photos are sampled evenly."""
 _MIN_OUTSIDE = 0.9
-"""Minimum share of the photos of the object whose frame does not contain a background Gaussian. Shares from 0.5 to 0.9
-give the same object for a bear on a duvet; a large share keeps objects that were photographed in parts."""
+"""Minimum share of the photos of the object whose frames do not contain a Gaussian for it to be background. For a bear
+on a duvet, shares from 0.5 to 0.9 give the same object; a large share keeps objects that were photographed in parts."""
 _HITS, _SOLID = 8, 0.3
 """Number of Gaussians next to a point that represent a click there, and their minimum opacity."""
 
@@ -55,8 +55,8 @@ def with_framing(cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camer
 
 
 def outside_frames(means: np.ndarray, point: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray | None:
-    """Return (n,), the share of the photos of ``point`` (3,) whose frame does not contain the ``means`` (n, 3); None
-    if there are few such photos."""
+    """Return (n,), for each of the ``means`` (n, 3) the share of the photos of ``point`` (3,) whose frames do not
+    contain it; None if too few photos show ``point``."""
     showing = [camera for camera in cameras if _in_frame(point[None], camera)[0]]
     if len(showing) < _MIN_PHOTOS:
         return None

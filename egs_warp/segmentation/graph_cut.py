@@ -40,14 +40,14 @@ class SplatGraph:
     strength: np.ndarray
     """(m,) 0 to 1, cost of cutting the link."""
     colour_unit: float = 1.0
-    """Mean difference of the colours, 0 to 1, of the ends of a link between neighbours."""
+    """Mean distance between the colours (0 to 1) of the two ends of a link between neighbours."""
 
     @classmethod
     def of(cls, cloud: GaussianCloud, chosen: np.ndarray, *, neighbours: int = _NEIGHBOURS) -> SplatGraph:
         """Link each of the ``chosen`` (n,) Gaussians, indices of ``cloud``, to its nearest ``neighbours``.
 
-        Training stacks Gaussians at one place, whose nearest neighbours are one another. Therefore only one Gaussian of
-        each place (``distinct_places``) is linked to the neighbours, and the others are linked to that one.
+        Training stacks Gaussians at one place, so that their nearest neighbours are in the same stack. Therefore only
+        one Gaussian of each place (``distinct_places``) is linked to its neighbours, and the others are linked to it.
         """
         points = cloud.means.numpy()[chosen].astype(np.float64)
         colours = cloud.sh.numpy()[chosen, 0].astype(np.float64) * SH_BAND_0 + 0.5
@@ -166,7 +166,7 @@ class SplatGraph:
 
 
 def distinct_places(points: np.ndarray, breadths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find Gaussians of similar breadth that lie at one place: in one cell of a grid about as fine as their breadth.
+    """Group Gaussians of similar breadth by place, a cell of a grid whose spacing is about this breadth.
 
     Args:
         points: (n, 3) means.
@@ -187,8 +187,8 @@ def distinct_places(points: np.ndarray, breadths: np.ndarray) -> tuple[np.ndarra
 def _differences(
     points: np.ndarray, colours: np.ndarray, first: np.ndarray, second: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return, for each link, the distance between its ends divided by the median, and the difference of their colours
-    divided by the mean; and that mean."""
+    """Return, for each link, the distance between its ends divided by the median of all links, and the distance between
+    their colours divided by the mean of all links; and this mean."""
     away = np.linalg.norm(points[first] - points[second], axis=1)
     apart = np.linalg.norm(colours[first] - colours[second], axis=1)
     if len(away) == 0:

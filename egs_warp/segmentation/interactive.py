@@ -120,9 +120,9 @@ def segment_by_clicks(
             same place, the later one counts.
         ground: the ground, in the frame of the capture.
         proposal: (n,) bool, Gaussians that belong to the object unless clicks beside it remove them; None for none.
-        outside: (n,) 0 to 1, share of the photos of the object whose frame does not contain a Gaussian; None if it is
-            unknown. Photographers keep the object in the picture, so in these photos the Gaussian's links lead out of
-            the object.
+        outside: (n,) 0 to 1, for each Gaussian the share of the photos of the object whose frames do not contain it;
+            None if it is unknown. Photographers keep the object in the frame, so this share of the strength of the
+            Gaussian's links counts as links that leave the object.
 
     Returns:
         (n,) bool, True for the object's Gaussians; all False without a click on it and without a proposal.

@@ -189,8 +189,8 @@ def _of_size(
 
 
 def foreign_haze(scene: SceneAbovePlane, object_mask: np.ndarray, size: float) -> np.ndarray:
-    """Return (n,) bool, True for the haze in ``object_mask`` (n,) bool that is neither inside the object, whose size is
-    ``size`` (scene units), nor near it with similar colours."""
+    """Return (n,) bool, True for haze in ``object_mask`` (n,) bool that does not belong to the object: it is neither
+    inside the object nor near it with similar colours. ``size`` is the size of the object, scene units."""
     result = np.zeros_like(object_mask)
     haze = _haze_indices(scene, np.flatnonzero(object_mask), size)
     solid = object_mask & scene.is_opaque

@@ -7,8 +7,8 @@ Input: a cloud and views to match. Output: a cloud whose renders match the views
 import os
 from importlib.util import find_spec
 
-# OpenMP reads this when PyTorch is imported. By default, its threads wait for each other in busy loops, which made a
-# training step 20 times slower on a machine on which other processes use the cores.
+# OpenMP reads this when PyTorch is imported. By default, its threads wait for each other in busy loops. If other
+# processes use the cores, too, this makes a training step 20 times slower.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 

@@ -1,5 +1,5 @@
-"""``egs-warp animate WORLD.yaml``: one film, and a trajectory and a report for each body; flags of a single capture are
-refused."""
+"""``egs-warp animate WORLD.yaml`` writes one film, and a trajectory and a report for each body. It refuses flags that
+describe a single capture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The joint cloud of several bodies: each part is deformed as alone, and the fixed part does not move."""
+"""Joint cloud of several bodies: each is deformed as by its own deformer, and the fixed part does not move."""
 
 from __future__ import annotations
 

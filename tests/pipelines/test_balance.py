@@ -40,8 +40,8 @@ def test_a_body_that_falls_over_is_reported_and_one_that_stands_is_not(monkeypat
 
 @pytest.mark.parametrize("lean", [0.75, -0.75])
 def test_a_weak_fibre_is_reported_if_the_body_must_balance(lean: float, tmp_path: Path) -> None:
-    """A leaning pawn, whose centre of mass is 0.03 of its height from an edge of its base, falls with one fibre of 0.01
-    body weights, on whichever side the edge is."""
+    """A leaning pawn with only one fibre, of 0.01 body weights, falls to either side: its centre of mass is within 0.03
+    body heights of an edge of its base."""
     built = pawn(gaussian_count=3000)
     means = built.cloud.means.numpy()
     means[:, 0] += lean * means[:, 2]

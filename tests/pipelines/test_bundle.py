@@ -123,7 +123,7 @@ def test_the_scene_of_a_run_is_a_static_body(run: FinishedRun, tmp_path: Path) -
 def test_the_light_of_a_run_is_in_the_bundle(
     run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The file has the light and the normals, to half a step, that the player needs; without a light it has neither."""
+    """The file has the light and, to half a quantisation step, the normals; without a light it has neither."""
     lit = replace(run, creature=replace(run.creature, light=LIGHT))
     export_bundle(lit, tmp_path / "a.egs", every=12)
     assert main(["validate", str(tmp_path / "a.egs")]) == 0

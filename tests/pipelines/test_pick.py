@@ -81,7 +81,7 @@ def test_labels_are_numbers_of_objects_and_the_active_one_has_precedence():
 def around(
     point: tuple[float, float, float], *, count: int = 9, span: float = 360.0, fov: float = 30.0
 ) -> list[Camera]:
-    """Return ``count`` cameras in an arc of ``span`` degrees in front of a point, at a distance of 3."""
+    """Return ``count`` cameras that look at a point from an arc of ``span`` degrees in front of it and above it."""
     angles = np.radians(-90.0 + span * (np.arange(count) / count - 0.5))
     eyes = [np.array(point) + 3.0 * np.array([np.cos(angle), np.sin(angle), 0.5]) for angle in angles]
     return [Camera.look_at(eye, np.array(point), UP, width=80, height=80, vertical_fov_degrees=30.0) for eye in eyes]
@@ -95,7 +95,7 @@ def test_the_proposal_of_a_scene_is_its_ground_and_the_object_at_which_the_camer
 
 
 def test_the_frames_of_the_photos_separate_the_object_from_a_wall_that_it_touches():
-    """Ball and wall have one colour, and no ground links to the wall, which most photos show only in part."""
+    """Ball and wall have the same colour and touch; most photos show only a part of the wall."""
     ball = round_ones(shell(), 0.025)
     wall = level((-3.0, 0.02), (3.0, 1.4), 0.51, 0.05)[:, [0, 2, 1]]
     floor = level((-3.0, -2.0), (3.0, 0.5), 0.0, 0.05)

@@ -50,8 +50,8 @@ def drawn(
 
 
 def test_a_scene_shows_its_stages_and_the_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The remaining time follows from the expected costs of the stages, and from the speed of the current one since its
-    first report: its first step may include an import."""
+    """The remaining time follows from the expected costs of the stages, and from the speed of the current stage after
+    its first report, because the time before that may include an import."""
     costs = {"plane": 12.0, "ground": 15.0, "segment": 48.0, "inpaint": 25.0}
     told = [
         (0.0, "plane", 0.0),
@@ -92,8 +92,8 @@ def test_skipped_stages_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_the_costs_of_a_scene_follow_its_sizes() -> None:
-    """The training at the plane grows with the object. The inpainting does not depend on the hole's size in
-    the scene."""
+    """The cost of training at the plane grows with the object. The cost of inpainting does not depend on the size of
+    the hole in scene units."""
     options = SceneOptions(clearing=StraddlingPolicy.FINETUNE)
     few, many = (options.costs(50_000, object_count=count) for count in (10_000, 40_000))
     assert many["segment"] > few["segment"] + 0.5

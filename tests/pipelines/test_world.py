@@ -1,5 +1,5 @@
-"""Worlds: one creature gives the bits of ``simulate``, distant bodies do not affect each other, a dropped prop comes to
-rest, and invalid worlds are refused with the name and the place of the body."""
+"""Worlds: a world of one creature gives the bits of ``simulate``, distant bodies do not affect each other, a dropped
+prop comes to rest, and errors name the body and its position."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def test_a_world_of_one_creature_gives_the_bits_of_the_creature_alone() -> None:
 
 @pytest.mark.slow
 def test_distant_bodies_do_not_affect_each_other() -> None:
-    """A creature 3 m away, turned by 90 degrees, moves as the creature alone does. A prop falls from 0.1 m in
-    sqrt(2 * 0.1 / g) = 0.143 s and comes to rest where it was dropped."""
+    """A jumping creature has the trajectory that it has alone, and a creature 3 m away stands. A prop falls from 0.1 m
+    in sqrt(2 * 0.1 / g) = 0.143 s and comes to rest where it was dropped."""
     creature, world = coarse_pawn(), World(friction=0.8)
     forward = np.degrees(np.arctan2(*creature.front.direction[[1, 0]]))
     near = world.add(creature)

@@ -85,8 +85,8 @@ def test_hardly_any(count: int) -> None:
 
 
 def test_gaussians_at_one_place_do_not_isolate_it() -> None:
-    """A line of places with eight coincident Gaussians each, as training stacks them, remains connected. The ten
-    nearest neighbours of a Gaussian alone connect hardly more than its own place."""
+    """A line of 50 places, at each of which training has stacked eight Gaussians, remains connected. Links to the six
+    nearest neighbours alone would not leave a place."""
     line = np.zeros((400, 3))
     line[:, 0] = np.repeat(np.arange(50), 8) + np.tile(0.001 * np.arange(8), 50)
     everywhere = np.arange(400)

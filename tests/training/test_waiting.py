@@ -8,7 +8,7 @@ import sys
 
 
 def test_a_scene_sets_the_waiting_policy_before_torch_is_imported() -> None:
-    """OpenMP reads the policy when PyTorch is imported; a value of the user has priority."""
+    """OpenMP reads the policy when PyTorch is imported. A value that the user has set is kept."""
     program = (
         "import os, sys; import egs_warp.pipelines.prepare_scene;"
         " print('torch' in sys.modules, os.environ['OMP_WAIT_POLICY'])"

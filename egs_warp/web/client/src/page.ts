@@ -17,7 +17,7 @@ const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
 /** Maximum time per image before the resolution is reduced, s: for a recorded run and for a live session. */
 const MAX_FRAME_TIME = 1 / 15;
 const MAX_LIVE_FRAME_TIME = 1 / 25;
-/** Time for which a recorded video shows the last image, ms. */
+/** Time for which the last image is recorded at the end of a video, ms. */
 const LAST_IMAGE_TIME = 300;
 const LAYERS: { name: LayerToggle; title: string; on: boolean; key: string }[] = [
   { name: "splats", title: "Creature", on: true, key: "1" },

@@ -152,8 +152,8 @@ export function splatRenderer(
   return { spark, floorDepth };
 }
 
-/** Release what Spark's objects for all renderers keep of a disposed renderer: the listeners with which the renderer
- * would release these objects, and the last shader with its textures. Other renderers upload the objects again. */
+/** Detach a disposed renderer from the objects that Spark shares between all renderers. These objects would keep the
+ * listeners of the renderer, and its last shader with its textures. Other renderers upload the objects again. */
 export function releaseSharedObjects(): void {
   for (const { fullScreenQuad } of [SplatAccumulator, Readback]) {
     fullScreenQuad.material = new THREE.RawShaderMaterial({ visible: false });
