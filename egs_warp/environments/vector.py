@@ -101,7 +101,7 @@ class CreatureVectorEnv(VectorEnv):
             if value < 1:
                 raise ArgumentError(name, "give a whole number of at least 1", value=value)
         if frictions is not None and len(frictions) != num_envs:
-            raise ArgumentError("frictions", f"{len(frictions)} are given; give one for each of {num_envs} worlds")
+            raise ArgumentError("frictions", f"the length is {len(frictions)}; give one for each of {num_envs} worlds")
         self.actions, self.reward, self.frames, self.creature = Actions(actions), reward, frames, creature
         body, planner = creature.body, creature.stepper.planner
         self._stepper = BatchStepper(

@@ -326,7 +326,7 @@ class BatchStepper:
         """Make one step of all worlds with planned activations, as ``LocomotionStepper.step`` does. Also return (c,)
         bool, True where a matrix could not be factored."""
         if self._planner is None:
-            raise ArgumentError("planner", "give BatchStepper the planner of a LocomotionStepper to step by objectives")
+            raise ArgumentError("planner", "give BatchStepper the planner of a LocomotionStepper to plan activations")
         with self._stages("detect"):
             inputs, previous_forces = self._start(state, self._stiffness * state.activations, dt, self.settings.drag)
         response, velocities, forces, failed = self._predict(inputs, previous_forces)

@@ -49,8 +49,8 @@ def creature() -> Creature:
 
 
 def rising(creature: Creature, speed: float, *, count: int = 4) -> Goals:
-    """Return ``count`` goals: rise at ``speed``, in units of sqrt(g H), with all nodes and without rotation, and unload
-    some nodes."""
+    """Return the first ``count`` of four objectives: the centre of mass rises at ``speed``, in units of sqrt(g H), the
+    body does not rotate, all nodes rise at ``speed``, and some nodes are unloaded."""
     body = creature.body
     up = -speed * body.speed_unit * body.gravity / np.linalg.norm(body.gravity)
     lifted = np.argsort(creature.start.positions @ body.gravity)[-9::3]
@@ -156,7 +156,7 @@ def test_every_step_is_searched_and_planned_again(creature: Creature, monkeypatc
 
 
 def test_failed_searches_are_repeated_on_the_host(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the kernel fails numerically, the plan is that of the host."""
+    """If the kernel fails numerically, the host computes the plan."""
     goals = [rising(creature, 0.3), rising(creature, 0.1)]
     asked, dt = [each(creature.start, None, 0.0) for each in goals], solver_steps(creature.body)[0]
     run, ends = batch_search.SearchPool.run, []
@@ -216,7 +216,7 @@ def test_unconverged_steps_are_halved_as_in_single_runs(creature: Creature, monk
 
 @pytest.mark.slow
 def test_jumps_over_different_distances_equal_single_runs(creature: Creature) -> None:
-    """30 steps in a closed loop, in which the motions measure the state of their world."""
+    """The motions compute the objectives of 30 steps from the states of their worlds, in a closed loop."""
 
     def jumps() -> list[Goals]:
         place = initial_stance(creature)

@@ -123,7 +123,7 @@ def test_a_correct_run_passes(run: Any) -> None:
     deepest = -min(float(t.min_gap[1:].min()) for t in recorded.trajectories)
     height = min(t.height for t in recorded.trajectories)
     assert pair.penetration * height <= deepest + 1e-9
-    # The work of the pair's contacts is that of the energy balances of both bodies.
+    # The work of the contacts equals the contact terms in the energy balances of both bodies.
     if run is collision:
         books = [energy_balance(t) for t in recorded.trajectories]
         flows = [sum(float((b.friction + b.contact + b.push_out).sum()) for b in books)]
