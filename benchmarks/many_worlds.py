@@ -10,11 +10,11 @@ positions of a node in the two runs, in body heights. Time by stage is measured 
 which every stage synchronises the device.
 
 With ``--planned``, each world plans a jump over its own distance (0.2 to 0.7 body heights) in a closed loop instead:
-its motion, a Python object, returns objectives for the state that the device has reached. The stage ``objectives``
-is the time of the motions and of the upload, and the rate without this stage is measured too.
+its motion, a Python object, computes the objectives of each step from the state at its start. The stage ``objectives``
+is the time of the motions and the transfers that they need; the rate without this stage is stored, too.
 
-``--matrices`` also times, in ms, factorisations of this number of dense matrices of each cage's size, with panels of
-several widths and with torch's own Cholesky factorisation, and solutions for 1 and 96 right-hand sides.
+``--matrices B`` also measures, in ms, the factorisation of B dense matrices of the size of each cage, with panels of
+several widths and with the Cholesky factorisation of PyTorch, and solutions for 1 and 96 right-hand sides.
 
 Aims: ``many_planned`` (``--planned`` on one GPU, 2,500 steps per second with 250 nodes and 700 with 568),
 ``many_2000`` (on one GPU, 2,000 steps per second with 250 nodes and 600 with 541), ``many_alike`` (on any device,
@@ -141,8 +141,8 @@ def measure(creature: Creature, jump: np.ndarray, worlds: int, *, alone: int, pa
 
 
 def measure_planned(creature: Creature, worlds: int, *, steps: int, alone: int, panel: int, chunk_bytes: int) -> Row:
-    """Measure the rate of ``worlds`` worlds that each plan a jump, the time by stage, and the deviation of ``alone`` of
-    the worlds from single runs over ``steps`` steps."""
+    """Measure ``steps`` steps of ``worlds`` worlds that each plan a jump: their rate, the time by stage, and the
+    distance of ``alone`` of the worlds from single runs."""
     device = torch.device(str(creature.body.assembly.device))
     watch = Stopwatch(device, on=True)
     dt, _ = solver_steps(creature.body)
@@ -201,7 +201,7 @@ def measure_planned(creature: Creature, worlds: int, *, steps: int, alone: int, 
 
 
 def _planning_stepper(creature: Creature, friction: float) -> LocomotionStepper:
-    """Return a single stepper that searches with the kernel of the batch."""
+    """Return a stepper of one world that searches contact modes with the kernel of the batch."""
     geometry, device = replace(creature.geometry, friction=friction), str(creature.body.assembly.device)
     settings = LocomotionSettings(qp_solver="admm")
     return LocomotionStepper(creature.body, creature.muscles, geometry, settings=settings, device=device)
@@ -217,8 +217,8 @@ def _jump(creature: Creature, distance: float) -> MotionSequence:
 def _planned_apart(
     creature: Creature, distance: float, friction: float, dt: float, steps: int, end: np.ndarray
 ) -> float:
-    """Run a planned jump with ``LocomotionStepper``; return a node's largest distance from ``end`` (N, 3), body
-    heights."""
+    """Run a planned jump with ``LocomotionStepper``. Return the largest difference of a node coordinate from ``end``
+    (N, 3), in body heights."""
     stepper, jump = _planning_stepper(creature, friction), _jump(creature, distance)
     state, memory = creature.start, stepper.initial_memory()
     report: StepReport | None = None

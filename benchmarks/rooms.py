@@ -1,5 +1,5 @@
-"""Overlap, time and plane clearing of the object in procedural rooms with a known truth, from the proposal of
-``egs-warp pick``, from clicks and from masks.
+"""Overlap, time and plane clearing of objects in procedural rooms with a known truth. The objects are proposed by
+``egs-warp pick``, clicked, or given by masks.
 
 The twenty rooms of ``room_scenes.py`` are captures with labelled Gaussians, and photos of them: toys on duvets, floors,
 grass and furniture, against walls, beside furniture, between other toys, half under a table. Eight photos are annotated
@@ -103,8 +103,8 @@ def rows_of(scene: SyntheticScene, cloud: GaussianCloud, options: argparse.Names
 
 
 def _proposal(scene: SyntheticScene, cloud: GaussianCloud) -> Pick:
-    """Return the proposal for ``cloud``. Raises ``UserError`` if there is none or if ``from-photos --yes`` refuses
-    it."""
+    """Return the proposal for ``cloud``. Raises ``UserError`` if there is none, or if ``from-photos --yes`` would
+    refuse it."""
     up = up_of_cameras(scene.cameras)
     assert up is not None
     graph = ClickGraph.of(cloud)

@@ -1,6 +1,6 @@
 """Accuracy of the remaining time in the progress bars of scenes and of simulations.
 
-The built-in pawn, and koala and fox if they are in the folder of data, are separated from their scenes. The pawn jumps,
+The built-in pawn, and koala and fox if the data folder contains them, are separated from their scenes. The pawn jumps,
 hops, twists and walks. At each update of the bar, the
 displayed remaining time is compared with the true remaining time, if that is at least 5 s, because the bar shows whole
 seconds.
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 SCRIPTS = ("jump", "hop x2", "twist", "walk 0.2")
 CAPTURES = {"koala.ply": ((0.1, -0.7, 0.15), "-y"), "fox.ply": ((0.0, 0.0, 2.0), "z")}
-"""Point on the object, and up direction, of each captured scene in the folder of data."""
+"""Point on the object, and up direction, of each captured scene in the data folder."""
 MIN_REMAINING = 5.0
 """Minimum true remaining time of a comparison, s."""
 
@@ -79,7 +79,7 @@ def simulated(creature: Creature, script: str, file: TextIO) -> int:
 
 
 def segmented(scene_cloud: GaussianCloud, point: Sequence[float], up: str, file: TextIO) -> int:
-    """Prepare the object at a ``point`` (3,) of a scene."""
+    """Prepare the scene of the object at ``point`` (3,)."""
     options = SceneOptions()
     spec = ObjectSpec(point=np.array(point))
     with scene_bar(options.costs(scene_cloud.count), file=file) as bar:

@@ -2,14 +2,14 @@
 
 python benchmarks/worlds.py [--quick] [--bodies N ...] [--nodes N] [--frames N] [--json PATH] [--plot PATH]
 
-Creatures, copies of the pawn, jump together for ``--frames`` frames: far apart, or in a row in which neighbours touch.
-In the third arrangement, two creatures jump among 30 props that are at rest and sleep. For each world, the median and
-the largest time of a step are measured, and the mean numbers of contacts with the ground and between bodies. The model
-t = c bodies^p is fitted to each arrangement.
+Copies of the pawn jump together for ``--frames`` frames, in three arrangements: far apart, in a row in which neighbours
+touch, and two of them far apart among 30 sleeping props. For each world, the median, mean and largest time of a step
+are measured, and the mean numbers of contacts with the ground and between bodies. The model t = c bodies^p is fitted to
+the first two arrangements.
 
-Aims on a CPU: ``apart_cost`` (two bodies that never meet take at most 1.1 times as long as two runs of one),
-``cpu_two_realtime`` (a frame of two creatures of 250 nodes takes at most 33 ms, also if they touch), ``sleeping_cost``
-(two creatures among 30 sleeping props take at most 1.5 times as long as two alone).
+Aims on a CPU: ``apart_cost`` (two bodies that never meet take at most 1.1 times as long as two runs of one body),
+``cpu_two_realtime`` (a frame of two creatures with 250 nodes each takes at most 33 ms, even if they touch),
+``sleeping_cost`` (two creatures among 30 sleeping props take at most 1.5 times as long as two alone).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ MAX_FRAME = 33.0
 
 
 def make_world(creature: Creature, prop: Prop, arrangement: str, bodies: int) -> World:
-    """Return a world of ``bodies`` creatures, with sleeping props in the arrangement ``SLEEPING``."""
+    """Return a world of ``bodies`` creatures, among props in the arrangement ``SLEEPING``."""
     world, points = World(), creature.shape.contact_points
     low = points[points[:, 2] < 0.1]
     width = float(np.ptp(low[:, 1]))
@@ -139,7 +139,7 @@ def summary(rows: list[Row]) -> dict[str, Any]:
     if (TOUCHING, 2) in means and rows[0]["nodes"] >= 225:
         aims["cpu_two_realtime"] = max(frames[APART, 2], frames[TOUCHING, 2]) <= MAX_FRAME
     if (SLEEPING, 2) in means:
-        # The median, because the props fall asleep in the first steps.
+        # The median excludes the first steps, in which the props are not yet asleep.
         medians = {row["arrangement"]: row["median_ms"] for row in rows if row["bodies"] == 2}
         aims["sleeping_cost"] = medians[SLEEPING] <= 1.5 * medians[APART]
     return {"aims": aims, "why_null": {name: why[name] for name, value in aims.items() if value is None}}

@@ -1,4 +1,4 @@
-"""Two figurines duel: the first turns to the second in the air and jumps against it.
+"""Two figurines duel: the first twists towards the second in a jump and then jumps against it.
 
 Writes the film, the contact sheet, the report, and a trajectory and a report for each body.
 """

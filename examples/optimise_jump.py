@@ -1,8 +1,8 @@
 """The pawn learns to jump high: the cross-entropy method optimises a crouch and a thrust over many worlds at once.
 
-Each world of a Gymnasium vector environment tries other parameters: the durations of crouch and thrust, and the target
-velocities of the centre of mass in them. The best quarter of the worlds determines where the next generation searches.
-It needs the extra gymnasium; on a GPU, 512 worlds are quick: --device cuda:0 --worlds 512.
+Each world of a Gymnasium vector environment tries its own parameters: the durations of the crouch and the thrust, and
+the target velocities of the centre of mass in them. The next generation is drawn from the distribution of the best
+quarter. The example needs the extra gymnasium. On a GPU, use more worlds: --device cuda:0 --worlds 512.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def main(arguments: list[str] | None = None) -> list[float]:
 
 
 def greatest_heights(worlds: egs.CreatureVectorEnv, candidates: np.ndarray, frames: int) -> np.ndarray:
-    """Return (B,) body heights, how far the centre of mass rises above its start with each of the ``candidates`` (B,
-    4). A world whose step cannot be solved counts as 0."""
+    """Return (B,), the greatest rise of the centre of mass above its start with each of the ``candidates`` (B, 4), in
+    body heights; 0 for a world whose step cannot be solved."""
     crouch_frames, crouch_speed, thrust_frames, thrust_speed = candidates.T
     worlds.reset()
     greatest, is_valid = np.zeros(len(candidates)), np.ones(len(candidates), bool)

@@ -35,8 +35,8 @@ class ContactSet(BatchedRecord):
     points: Any
     """(n,) or (B, K) int, indices into the geometry's points."""
     nodes: Any
-    """(n, 4) or (B, K, 4) int32, nodes of each point's tetrahedron. If there are contacts between bodies, (n, 8): the
-    nodes of the other body's tetrahedron follow."""
+    """(n, 4) or (B, K, 4) int32, nodes of each point's tetrahedron. In worlds of several bodies (n, 8): the nodes of
+    the tetrahedron of the other body follow."""
     weights: Any
     """(n, 4) or (B, K, 4) float64, barycentric weights, sum 1. The weights of another body's tetrahedron are negative,
     sum -1; for a contact with the ground they are 0."""
@@ -148,7 +148,8 @@ class ContactSet(BatchedRecord):
 
     @cached_property
     def addresses(self) -> list[int]:
-        """Number of contacts of one world with the ground, and the host addresses of their nodes, weights and axes."""
+        """Number of contacts of one world, and the host addresses of their nodes, weights and axes. All contacts must
+        have one side."""
         assert self.nodes.shape[1] == 4
         return [self.count, *(array.ptr or 0 for array in self.arrays[1:])]
 
@@ -184,8 +185,8 @@ class ContactSet(BatchedRecord):
         return replace(self, **arrays)
 
     def with_nodes_of(self, nodes: slice) -> ContactSet:
-        """Return the contacts of one world with the nodes numbered from the start of ``nodes``; other nodes get
-        negative numbers. The result serves to compare nodes only."""
+        """Return the contacts of one world with node numbers relative to the start of ``nodes``, and -1 for other
+        nodes. The result can only be used to compare node numbers."""
         if nodes == slice(None):
             return self
         is_inside = (self.nodes >= nodes.start) & (self.nodes < nodes.stop)

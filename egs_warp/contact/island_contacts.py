@@ -15,7 +15,7 @@ from egs_warp.contact.pair_contact import PairContactDetector
 from egs_warp.contact.selection import ACTIVATION_DEPTH
 
 _MIN_RATIO = 1e-6
-"""Lower bound of Coulomb coefficients in their ratios, because a tangent of length 0 has no velocity."""
+"""Lower bound of Coulomb coefficients in the lengths of tangents, because forces are divided by these lengths."""
 
 
 @dataclass(frozen=True)
@@ -23,18 +23,17 @@ class IslandContacts:
     """Detection and selection of the contacts of an island. Contacts are identified by the numbers of
     ``PairContactDetector``; all arrays have the concatenated nodes of the bodies.
 
-    Coulomb's law of the island has one coefficient, the largest. A contact with another coefficient has shorter
-    tangents: with the ratio s of the coefficients, tangents s t have velocities s u_t and forces f_t / s, so that the
-    cone |f_t / s| <= mu f_n is the cone of the coefficient s mu.
+    The Coulomb solve of the island uses one coefficient mu, the largest. A contact with a smaller coefficient s mu has
+    shorter tangents s t, with velocities s u_t and forces f_t / s. Its cone |f_t / s| <= mu f_n is that of the
+    coefficient s mu.
     """
 
     grounds: tuple[ContactDetector, ...]
-    """Contact of each body with the ground."""
+    """Detector of the contacts of each body with the ground."""
     pairs: PairContactDetector
-    """Contact between the bodies."""
+    """Detector of the contacts between the bodies."""
     frictions: np.ndarray
-    """(k, k + 1) Coulomb coefficients of the contacts of each body with each other body, and in the last column with
-    the ground."""
+    """(k, k + 1) Coulomb coefficients of each body with each other body and, in the last column, with the ground."""
 
     @property
     def friction(self) -> float:
@@ -43,7 +42,7 @@ class IslandContacts:
 
     def tangent_lengths(self, keys: np.ndarray) -> np.ndarray:
         """Return (n, 3), the lengths of the axes of the contacts with the ``keys`` (n, 3) of ``PairContactDetector``: 1
-        for the normal, and the ratio of the Coulomb coefficients for the tangents."""
+        for the normal, and for the tangents the Coulomb coefficient divided by the largest one."""
         ratios = np.maximum(self.frictions[keys[:, 0], keys[:, 1]], _MIN_RATIO) / max(self.friction, _MIN_RATIO)
         return np.column_stack([np.ones(len(keys)), ratios, ratios])
 
@@ -127,7 +126,7 @@ class IslandContacts:
         return least
 
     def _by_body(self, positions: np.ndarray) -> Sequence[tuple[ContactDetector, np.ndarray]]:
-        """Return the ground contact and the positions of each body."""
+        """Return the detector of ground contacts and the positions of each body."""
         return list(zip(self.grounds, np.split(positions, self.pairs.node_starts[1:-1]), strict=True))
 
 

@@ -1,7 +1,7 @@
 """Newton iterates of the step of an island: several bodies with contact between them (Eq. 4, 8).
 
-``island_problem`` contains the equations and the block-diagonal tangent. Contact velocities and Coulomb's law are those
-of one body, for contacts with one or two sides.
+``fem.island_problem`` contains the equations and the block-diagonal tangent. Contact velocities and Coulomb forces are
+computed as for one body, from contacts with two sides.
 """
 
 from __future__ import annotations

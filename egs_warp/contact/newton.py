@@ -242,7 +242,7 @@ class NewtonStepResult:
 
 
 class HostNewtonStep:
-    """The Newton step of iterates with NumPy arrays."""
+    """Newton step of iterates whose arrays are NumPy arrays."""
 
     def newton_steps(
         self: NewtonIterate, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None

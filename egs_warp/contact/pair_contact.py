@@ -53,9 +53,8 @@ class PairBody:
 class PairContactDetector:
     """Detector of the contacts between the bodies of one world.
 
-    The nodes and the contact points of the bodies are concatenated. The contact of a point with body b has the number
-    (b + 1) P plus the number of the point, where P is the number of all points; smaller numbers are contacts with the
-    ground. So one number identifies every contact of the world.
+    The nodes and the contact points of the bodies are concatenated. Each contact of the world has a number: point p of
+    all P points has the number p for its contact with the ground, and (b + 1) P + p for its contact with body b.
     """
 
     def __init__(self, bodies: Sequence[PairBody], *, device: str | None = None) -> None:
@@ -82,8 +81,8 @@ class PairContactDetector:
         return (other + 1) * self.point_starts[-1] + self.point_starts[body] + points
 
     def keys(self, numbers: np.ndarray) -> np.ndarray:
-        """Return (n, 3) for the ``numbers`` (n,) of contacts: body a, body b (-1 for the ground), and the point of body
-        a."""
+        """Return the keys (n, 3) of the contacts with the ``numbers`` (n,): body a, body b (-1 for the ground), and the
+        point of body a."""
         others, points = np.divmod(numbers, self.point_starts[-1])
         bodies = np.searchsorted(self.point_starts, points, side="right") - 1
         return np.column_stack([bodies, others - 1, points - self.point_starts[bodies]])
@@ -94,7 +93,7 @@ class PairContactDetector:
         """
         boxes = []
         for body, weights, part in zip(self.bodies, self._box_weights, self._split(positions), strict=True):
-            # The cage encloses the body, but the tetrahedron of a prop does not.
+            # A cage encloses its body; the single tetrahedron of a prop need not enclose it.
             corners = part if weights is None else weights @ part
             margin = BODY_INFLATION * body.selector.activation_distance
             boxes.append((corners.min(axis=0) - margin, corners.max(axis=0) + margin))
@@ -142,7 +141,7 @@ class PairContactDetector:
         keys, found = self.keys(contacts), [np.zeros(0, int)]
         for a, b in self.body_pairs(end):
             if self.gaps(a, b, end).min() < -ACTIVATION_DEPTH * tolerance:
-                # The gaps at the end come last, because the record extrapolates in the tetrahedra that they find.
+                # The end gaps come last, because ``contact_set`` uses the tetrahedra found by the last evaluation.
                 start_gaps, end_gaps = self.gaps(a, b, start), self.gaps(a, b, end)
                 own = keys[(keys[:, 0] == a) & (keys[:, 1] == b), 2]
                 points = self.bodies[a].selector.find_penetrating(own, end_gaps, start_gaps, tolerance)
@@ -150,7 +149,7 @@ class PairContactDetector:
         return np.concatenate(found)
 
     def subset(self, members: Sequence[int]) -> PairContactDetector:
-        """Return the detector of some of the bodies, which shares the buffers of this one."""
+        """Return a detector of some of the bodies. It shares the buffers of this one."""
         other = copy(self)
         other._set_bodies([self.bodies[i] for i in members], [self._states[i] for i in members])
         return other

@@ -1,4 +1,4 @@
-"""Results of a trial on a GPU that the host reads, in one array, so that they take a single transfer."""
+"""Results of a GPU trial that the host reads. They share one array, so that one transfer downloads them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from egs_warp.kernels.contact.newton_convergence import ROW_SIZE
 
 
 class TrialReadback(NamedTuple, Generic[ArrayT]):
-    """Results of a trial, views of one array on the device or on the host. The next trial overwrites the memory."""
+    """Results of a trial: views of one array on the device or on the host. The next trial overwrites them."""
 
     residual_norm: ArrayT
     """(1,) N s, norm of the residual; not finite where an element is inverted."""
@@ -38,7 +38,7 @@ class TrialReadback(NamedTuple, Generic[ArrayT]):
 
 
 class ReadbackBuffers:
-    """Results of a trial of up to K contacts and N nodes, on the device and in page-locked memory of the host."""
+    """Results of a trial with up to K contacts and N nodes, on the device and in page-locked host memory."""
 
     def __init__(self, stream: GraphStream, capacity: int, node_count: int) -> None:
         width, size = 3 * capacity, 3 * node_count

@@ -1,4 +1,4 @@
 """Environments for reinforcement learning and optimisation over many worlds (beyond the paper; extra ``gymnasium``).
 
-Input: a creature, actions of each world. Output: observations, rewards and ended episodes of each world.
+Input: a creature and the actions of each world. Output: observations and rewards of each world, and ends of episodes.
 """

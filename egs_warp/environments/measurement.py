@@ -1,4 +1,4 @@
-"""Measurement of many worlds of one body, without units, as the observation of an environment."""
+"""Dimensionless measurement of many worlds of one body: the observation of an environment."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def measure(body: SoftBody, start: torch.Tensor, state: BatchState, means: torch
         body: the body.
         start: (N, 3) m, positions at the start.
         state: state of B worlds.
-        means: (M, m) 1/m, matrix that maps activations to the means of their synergies.
+        means: (M, m) 1/m, matrix that maps muscle activations to ``Measurement.activations``.
     """
     mass = torch.as_tensor(body.node_mass, device=start.device)[:, None]
     centre, start_centre = ((mass * each).sum(dim=-2) / body.mass for each in (state.positions, start))

@@ -37,11 +37,11 @@ class Actions(Enum):
     """Meaning of the actions of an environment."""
 
     ACTIVATIONS = "activations"
-    """(m,) activation of each synergy as a fraction of its bounds, held for a frame. A change is limited to the maximum
-    rate of activations."""
+    """(m,) target activation of each synergy in the frame, as a fraction of its bounds. The activations approach their
+    targets at most at the maximum rate."""
     TARGETS = "targets"
-    """(3,) target velocity of the centre of mass in sqrt(g H), for which each solver step plans activations, without
-    rotation of the body."""
+    """(3,) target velocity of the centre of mass in sqrt(g H). Each solver step plans activations for this velocity and
+    for zero angular momentum."""
 
     @classmethod
     def _missing_(cls, value: object) -> Actions:
@@ -70,8 +70,8 @@ class CreatureVectorEnv(VectorEnv):
     """Many worlds of one creature as a Gymnasium vector environment.
 
     A step of the environment is one frame of 1/60 s. An observation is ``Measurement.vectors``. An episode ends
-    (``terminated``) when a step cannot be solved, or (``truncated``) after ``frames`` frames; the next step then begins
-    a new episode of that world and ignores its action (``AutoresetMode.NEXT_STEP``).
+    (``terminated``) when a step cannot be solved, or (``truncated``) after ``frames`` frames. The next step of the
+    environment begins a new episode of that world and ignores its action (``AutoresetMode.NEXT_STEP``).
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class CreatureVectorEnv(VectorEnv):
             if value < 1:
                 raise ArgumentError(name, "give a whole number of at least 1", value=value)
         if frictions is not None and len(frictions) != num_envs:
-            raise ArgumentError("frictions", f"{len(frictions)} are given; give one for each of {num_envs} worlds")
+            raise ArgumentError("frictions", f"the length is {len(frictions)}; give one for each of {num_envs} worlds")
         self.actions, self.reward, self.frames, self.creature = Actions(actions), reward, frames, creature
         body, planner = creature.body, creature.stepper.planner
         self._stepper = BatchStepper(
@@ -166,7 +166,7 @@ class CreatureVectorEnv(VectorEnv):
         return measure(self.creature.body, self._nodes, self._state, self._means)
 
     def _restart(self, worlds: np.ndarray) -> None:
-        """Put the creature of the ``worlds`` (B,) bool at the start."""
+        """Return the ``worlds`` (B,) bool to the start state."""
         if not worlds.any():
             return
         again, others = (torch.as_tensor(np.flatnonzero(each), device=self._nodes.device) for each in (worlds, ~worlds))
@@ -199,22 +199,22 @@ class CreatureVectorEnv(VectorEnv):
         return failed.cpu().numpy()
 
     def _activations(self, state: BatchState, desired: torch.Tensor) -> torch.Tensor:
-        """Return (c, M) m, the activations of all muscles nearest to those ``desired`` (c, m) of the synergies that
-        their maximum rate allows."""
+        """Return (c, M) m, the activations of all muscles that are nearest to the ``desired`` activations (c, m) of the
+        synergies within the limit of their rate."""
         lower, upper = self._planner.activation_bounds(state.activations @ self._means, self._dt)
         return torch.maximum(torch.minimum(desired, upper), lower) @ self._members.T
 
     def _target_rows(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the rows of the objectives of ``Actions.TARGETS``, times sqrt(2 weight): (3, 3N) of the centre of
-        mass, and (3N,) entries of the nodes."""
+        """Return the rows of the objectives of ``Actions.TARGETS``, times sqrt(2 weight): (3, 3N) for the centre of
+        mass, and the diagonal (3N,) of those for the nodes."""
         body = self.creature.body
         rows = np.sqrt(2.0 * CENTRE_WEIGHT) * np.asarray(body.mean_rows)
         shares = np.sqrt(2.0 * SHAPE_WEIGHT) * body.mass_roots
         return torch.as_tensor(rows, device=self._nodes.device), torch.as_tensor(shares, device=self._nodes.device)
 
     def _objectives(self, targets: torch.Tensor) -> BatchObjectives:
-        """Return the objectives of the ``targets`` (c, 3): velocity of the centre of mass, no angular momentum, and the
-        same velocity of all nodes."""
+        """Return the objectives for the ``targets`` (c, 3): this velocity of the centre of mass and, with a small
+        weight, of all nodes, and zero angular momentum."""
         (rows, entries), count = self._rows, len(targets)
         speeds = self.creature.body.speed_unit * targets
         indices = torch.arange(len(entries), device=targets.device)

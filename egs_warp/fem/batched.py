@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Array: TypeAlias = "np.ndarray | torch.Tensor"
 """A NumPy array or a PyTorch tensor."""
 ArrayT = TypeVar("ArrayT", "np.ndarray", "torch.Tensor")
-"""Type of the arrays of a record or a function: either all are NumPy arrays, or all are PyTorch tensors."""
+"""Type of the arrays of a record or a function: all NumPy arrays, or all PyTorch tensors."""
 
 
 @dataclass(frozen=True)
@@ -150,8 +150,8 @@ def _array(value: Any) -> Any:
 
 
 def allocate_struct(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: wp.Device, **arrays: wp.array) -> Any:
-    """Return an instance of a Warp ``struct`` with zeroed arrays on ``device``, of the given ``shapes`` by field, and
-    with the given ``arrays``."""
+    """Return an instance of a Warp ``struct`` with zeroed arrays on ``device`` in the fields of ``shapes``, and with
+    the given ``arrays`` in the other fields."""
     instance = struct()
     for name, array in (_zeroed_fields(struct, shapes, device) | arrays).items():
         setattr(instance, name, array)
@@ -164,10 +164,10 @@ def _zeroed_fields(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: w
 
 
 class StructPerWorld:
-    """A Warp struct with arrays for each of B worlds, as an array of structs on a device.
+    """Array on a device of one Warp struct for each of B worlds, with the arrays to which they refer.
 
-    ``structs`` (B,) is the argument of a kernel. The structs hold the addresses of the arrays, so this object must
-    exist as long as they are used.
+    ``structs`` (B,) is the argument of a kernel. The structs contain only the addresses of the arrays, so this
+    object must exist as long as they are used.
     """
 
     def __init__(

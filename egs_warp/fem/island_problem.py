@@ -1,7 +1,7 @@
-"""The implicit step of an island: several bodies that may touch each other, with concatenated nodes (Eq. 4, 6).
+"""The implicit step of an island, that is, of several bodies that may touch each other (Eq. 4, 6).
 
-The equations of the bodies are those of ``StepProblem``, one after the other. Only contact forces couple them, so the
-tangent is block diagonal.
+The nodes of the bodies are concatenated. Each body has the equations of ``StepProblem``. Only contact forces couple
+them, so the tangent is block diagonal.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.muscles.tension import MuscleEnergy
 
 Tensions = Sequence[MuscleEnergy | None] | None
-"""Muscle energy of each body of an island; None without muscles."""
+"""Muscle energy of each body of an island, None for bodies without muscles; None if no body has muscles."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +117,8 @@ class IslandTangent:
         return tuple(block.factors for block in self.blocks)
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
-        """Return J^-1 ``impulses``, m/s, for impulses (3N,) or (3N, m), N s. Columns that are zero in the rows of a
-        body are not solved there."""
+        """Return J^-1 ``impulses``, m/s, for impulses (3N,) or (3N, m), N s. In each block, columns that are zero are
+        skipped."""
         solved = np.zeros(impulses.shape)
         for block, right, out in zip(
             self.blocks, self.problem.split(impulses), self.problem.split(solved), strict=True

@@ -253,7 +253,7 @@ class MultifrontalLdl:
 
         if panels > 1:
             if kernel not in self._loaded:
-                # Loading a module is not safe from two threads at once.
+                # Two threads must not load a module at the same time.
                 kernel.module.load(self._device, block_dim=1)
                 self._loaded.add(kernel)
             run_concurrently(launch, launch)

@@ -23,18 +23,18 @@ class Audit:
     energy_residual: float
     """Residual of the energy balance, divided by m g H."""
     cone_violation: float
-    """Force outside the friction cone, divided by m g, for contacts with the ground and solids. ``world_audit`` audits
-    the contacts between bodies."""
+    """Force outside the friction cone, divided by m g, at contacts with the ground and solids. ``world_audit`` covers
+    contacts between bodies."""
     friction_gap: float
     """Difference between the actual work of friction and the work of a friction force at its bound that opposes the
-    slip, divided by m g H, for contacts with the ground and solids."""
+    slip, divided by m g H, at contacts with the ground and solids."""
     contact_velocity: float
     """Difference between the stored end velocities of loaded contacts and their displacements per time step, divided by
     sqrt(g H)."""
     penetration: float
     """Depth of the deepest contact point, divided by H."""
     complementarity_gap: float
-    """Normal force times gap at the end of the step, divided by m g H, for contacts with the ground and solids."""
+    """Normal force times gap at the end of the step, divided by m g H, at contacts with the ground and solids."""
     inverted_elements: int
     """Number of inverted elements, summed over all states."""
     newton_unconverged: int
@@ -115,7 +115,7 @@ def start_points(t: Trajectory) -> np.ndarray:
 
 def _start_gaps(t: Trajectory) -> np.ndarray:
     """Return (C,) m, distance of each contact from its plane, or from the tangent plane of uneven ground, at the start
-    of its step; for contacts with other bodies, a value without meaning."""
+    of its step. The values of contacts with other bodies are meaningless."""
     planes = t.planes[np.maximum(t.contact_plane, 0)]
     points = start_points(t)
     gaps = np.einsum("ci,ci->c", planes[:, :3], points) + planes[:, 3]

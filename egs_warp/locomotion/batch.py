@@ -1,7 +1,7 @@
 """Steps of many worlds of one body in lockstep on one device, with planned or with prescribed activations.
 
-For each world, ``BatchStepper`` solves the same equations and makes the same decisions as ``LocomotionStepper`` with
-the QP solver ``admm``, with kernels over all worlds and batched matrix products.
+In each world, ``BatchStepper`` solves the same equations and makes the same decisions as ``LocomotionStepper`` with the
+QP solver ``admm``. Kernels and batched matrix products process all worlds at once.
 """
 
 from __future__ import annotations
@@ -72,11 +72,11 @@ class BatchStepper:
             chunk_bytes: maximum total size, in bytes, of the matrices that are factored at a time. The temporary memory
                 takes several times as much in addition.
             stages: timer of the stages of a step.
-            planner: planner of a single world of the same body and settings, which ``advance`` requires
-                (``LocomotionStepper.planner``).
+            planner: planner of a single world of the same body and settings (``LocomotionStepper.planner``); only
+                ``advance`` requires it.
 
         Raises:
-            UserError: The strategy of the settings of ``planner`` does not run in batches.
+            UserError: ``planner`` has a strategy that does not run in batches.
         """
         self.settings = settings or LocomotionSettings()
         self.device = torch.device(str(body.assembly.device))
@@ -173,7 +173,7 @@ class BatchStepper:
 
         Args:
             state: worlds to step.
-            objectives: objectives on the end of the step of each of these worlds.
+            objectives: objectives of each of these worlds on the end of the step.
             dt: step size, s.
 
         Returns:
@@ -215,7 +215,7 @@ class BatchStepper:
     def _solved(
         self, state: BatchState, after: BatchState, done: list[BatchStep], failed: torch.Tensor
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
-        """Return the result of ``advance_with_activations``: remove the worlds in which no part of the step converged.
+        """Return the result of ``advance_with_activations``, without the worlds in which no part of the step converged.
 
         Args:
             state: worlds at the start.
@@ -258,8 +258,8 @@ class BatchStepper:
     def _half_steps(
         self, state: BatchState, activations: torch.Tensor, dt: float, max_halvings: int
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
-        """Make two steps of ``dt`` / 2 seconds, which are halved again where they do not converge; results as of
-        ``_parts``."""
+        """Make two steps of ``dt`` / 2 seconds, and halve them again where they do not converge. The results are those
+        of ``_parts``."""
         done: list[BatchStep] = []
         failed = torch.zeros(len(state.worlds), dtype=torch.bool, device=self.device)
         rows = torch.arange(len(state.worlds), device=self.device)
@@ -273,8 +273,8 @@ class BatchStepper:
     def _best_half_steps(
         self, state: BatchState, planned: torch.Tensor, objectives: BatchObjectives, dt: float
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
-        """Make half steps with the ``planned`` activations (c, M), m, and with the activations of the last step. Return
-        the better result of each world, as ``LocomotionStepper.advance`` does; a world fails if it fails in either.
+        """Make half steps twice: with the ``planned`` activations (c, M), m, and with those of the last step. Return
+        the better result of each world, as ``LocomotionStepper.advance`` does. A world fails if it fails in either.
         """
         results = [
             self._half_steps(state, activations, dt, MAX_HALVINGS) for activations in (planned, state.activations)
@@ -326,7 +326,7 @@ class BatchStepper:
         """Make one step of all worlds with planned activations, as ``LocomotionStepper.step`` does. Also return (c,)
         bool, True where a matrix could not be factored."""
         if self._planner is None:
-            raise ArgumentError("planner", "give BatchStepper the planner of a LocomotionStepper to step by objectives")
+            raise ArgumentError("planner", "give BatchStepper the planner of a LocomotionStepper to plan activations")
         with self._stages("detect"):
             inputs, previous_forces = self._start(state, self._stiffness * state.activations, dt, self.settings.drag)
         response, velocities, forces, failed = self._predict(inputs, previous_forces)
@@ -361,7 +361,7 @@ class BatchStepper:
         objectives: BatchObjectives,
         value: torch.Tensor,
     ) -> tuple[ContactSet, BatchResult, BatchPlan]:
-        """Plan again about the solved end in some worlds, as ``LocomotionStepper.step`` does, and solve again.
+        """Plan some worlds again about their solved ends, as ``LocomotionStepper.step`` does, and solve them again.
 
         Args:
             worlds: (k,) the worlds.

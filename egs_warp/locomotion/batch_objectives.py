@@ -53,7 +53,7 @@ class BatchObjectives(BatchedRecord):
         )
 
     def form(self, problem: BatchProblem, contacts: ContactSet, velocities: torch.Tensor, m: int) -> torch.Tensor:
-        """Return the quadratic form (c, k + 1, k + 1) of their cost in (x, 1), see ``step_cost.objectives_cost``.
+        """Return the quadratic form (c, k + 1, k + 1) of the cost in (x, 1), see ``step_cost.objectives_cost``.
 
         Args:
             problem: steps of c worlds.
@@ -80,7 +80,7 @@ class BatchObjectives(BatchedRecord):
     def value(
         self, problem: BatchProblem, contacts: ContactSet, velocities: torch.Tensor, forces: torch.Tensor
     ) -> torch.Tensor:
-        """Return (c,), the weighted squares at an end of the step, see ``step_cost.objectives_value``.
+        """Return the costs (c,) at an end of the step, see ``step_cost.objectives_value``.
 
         Args:
             problem: steps of c worlds.
@@ -99,7 +99,7 @@ class BatchObjectives(BatchedRecord):
 
 
 def _stacked(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Return (c, L, ...), the arrays ``parts`` (l, ...) with zeros up to the largest length L."""
+    """Return (c, L, ...), the arrays ``parts`` (l, ...) padded with zeros to the largest length L."""
     stacked = np.zeros((len(parts), max(len(part) for part in parts), *parts[0].shape[1:]))
     for one, part in zip(stacked, parts, strict=True):
         one[: len(part)] = part
@@ -113,7 +113,8 @@ def _angular_momentum(problem: BatchProblem) -> torch.Tensor:
 
 
 def _momentum_unit(problem: BatchProblem) -> torch.Tensor:
-    """Return (c,) kg m^2/s, the unit of ``AngularMomentumObjective``: mass, radius of gyration and unit of speed."""
+    """Return (c,) kg m^2/s, the unit of ``AngularMomentumObjective``: mass times radius of gyration times unit of
+    speed."""
     body = problem.body
     half_trace = (problem.node_mass[:, None] * problem.lever_arms.square()).sum(dim=(1, 2))
     return body.mass * (half_trace / body.mass).sqrt() * body.speed_unit

@@ -1,6 +1,6 @@
-"""The plans of many worlds of one body on their device: linear step, QP, search and expected end (Eq. 7, 8, 9, 12, 13).
+"""Plans of many worlds of one body on a device: linear step, QP, search and expected end (Eq. 7, 8, 9, 12, 13).
 
-Each world has the plan of ``StepPlanner.plan`` with the strategy ``modes`` and the QP solver ``admm``.
+The plan of each world is that of ``StepPlanner.plan`` with the strategy ``modes`` and the QP solver ``admm``.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class BatchPlanner:
             stages: timer of the stages of a step.
 
         Raises:
-            UserError: The settings of ``planner`` have another strategy than ``modes``.
+            UserError: The strategy of ``planner`` is not ``modes``.
         """
         if Strategy(planner.settings.strategy) is not Strategy.MODES:
             strategy = Strategy(planner.settings.strategy).value
@@ -203,8 +203,8 @@ class BatchPlanner:
     def _add_effort(
         self, problem: BatchProblem, predicted: torch.Tensor, velocities: torch.Tensor, form: torch.Tensor
     ) -> torch.Tensor:
-        """Add the elastic effort (``EffortModel``, ``effort_cost``) to ``form``; arguments and result as for
-        ``_write_program``, with the predicted end velocities (c, N, 3) m/s."""
+        """Add the elastic effort (``EffortModel``, ``effort_cost``) to ``form``. ``predicted`` (c, N, 3) m/s are the
+        predicted end velocities; the other arguments and the result are those of ``_write_program``."""
         body, elements, count = self._planner.body, self._common.elements, len(predicted)
         duration = max(EFFORT_HORIZON * body.time_unit, problem.dt)
         ends, gradient = problem.end_positions(predicted), torch.empty_like(predicted)
@@ -239,9 +239,9 @@ class BatchPlanner:
     ) -> BatchPlan:
         """Build the plans from the packed results of the search.
 
-        The contact forces are computed again from Coulomb's law for the activations of the result. If the expected end
-        inverts an element, the predicted velocities are used instead. Where no QP has a solution, the plan contains the
-        previous activations and the predicted end.
+        The contact forces are computed again from Coulomb's law for the activations of the result. If an element is
+        inverted at the expected end, the predicted velocities are used instead. If no QP of a world has a solution, its
+        plan consists of the previous activations and the predicted end.
         """
         status, counts, infeasible, _, has_point = result[:, :5].T
         weight, m = self._planner.body.weight, self._members.shape[1]

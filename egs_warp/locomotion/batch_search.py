@@ -1,7 +1,7 @@
-"""The mode searches of many worlds on their device, with a restart where the objective is high.
+"""Mode searches of many worlds on a device, with a restart in worlds whose objective is high.
 
-Each world has the result of ``strategies.search_program`` with the solver ``admm``. Where a kernel fails numerically,
-the host repeats the search of that world.
+The result of each world is that of ``strategies.search_program`` with the solver ``admm``. If a kernel fails
+numerically in a world, the host repeats the search of this world.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from egs_warp.locomotion.strategies import RESTART_COST, RESTART_GAP
 from egs_warp.precision import Vec3, real
 
 POOL, RELAXATION_POOL = 512, 256
-"""Maximum number of worlds that are searched at once, and whose relaxed optima are computed at once."""
+"""Maximum number of worlds in a launch of the search, and in a launch that computes relaxed optima."""
 _STATUS, _COUNT, _INFEASIBLE, _OBJECTIVE, _HAS_POINT = range(5)
 """Entries of the header of a packed result."""
 
 
 @dataclass(frozen=True)
 class BatchProgram(BatchedRecord):
-    """The QPs of c worlds with m activations and up to K contacts, packed for the search, and the linearised contact
-    from which they were built."""
+    """QPs of c worlds with m activations and up to K contacts, packed for the search, and the linearised contacts from
+    which they were built."""
 
     packed: torch.Tensor
     """(c, ...) packed input of ``mode_search_kernel``."""
@@ -103,8 +103,8 @@ class BatchProgram(BatchedRecord):
         return self.contact_velocities.shape[2] - 1 - self.contact_velocities.shape[1]
 
     def contact_forces(self, activations: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
-        """Return the Coulomb forces (c, K, 3) N for ``activations`` (c, m), from the initial forces ``start`` (c, K,
-        3) N."""
+        """Return the Coulomb forces (c, K, 3) N for ``activations`` (c, m). The iteration begins at the forces
+        ``start`` (c, K, 3) N."""
         m = self.activation_count
         free = self.contact_velocities[:, :, -1] + (self.contact_velocities[:, :, :m] @ activations[..., None])[..., 0]
         operands = self.delassus, free, self.normal_bias, self.frictions, start
@@ -152,7 +152,7 @@ class BatchModeSearch:
         return best
 
     def _allocate(self, contacts: int) -> None:
-        """Allocate scratch memory for worlds with up to ``contacts`` contacts, if there is not enough."""
+        """Allocate scratch memory for worlds with up to ``contacts`` contacts, unless there is enough."""
         if contacts <= self._capacity:
             return
         self._capacity = round_up(max(contacts, 1), CAPACITY_MULTIPLE)
@@ -205,7 +205,7 @@ class BatchModeSearch:
         return result[:, HEADER_SIZE:], result[:, 1], is_known
 
     def _search_from(self, program: BatchProgram, activations: torch.Tensor) -> torch.Tensor:
-        """Search in each world from ``activations`` (c, m) and the contact forces that they cause."""
+        """Search again in each world, starting from ``activations`` (c, m) and the contact forces that they cause."""
         forces, packed = program.contact_forces(activations, program.forces), program.packed.clone()
         enabled = torch.zeros(len(packed), dtype=torch.int32, device=packed.device)
         launch_on(

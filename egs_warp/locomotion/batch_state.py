@@ -1,4 +1,4 @@
-"""State of many worlds of one body, and the result of their step, on a device."""
+"""State of many worlds of one body, and the result of one of their steps, on a device."""
 
 from __future__ import annotations
 

@@ -26,8 +26,8 @@ from egs_warp.precision import real
 CAPACITY_MULTIPLE = 8
 """Contact capacities are multiples of this."""
 WORLD_BLOCK = 128
-"""Number of threads of the block of each world on a GPU; smaller than for one world, so that several blocks run on a
-multiprocessor."""
+"""Number of threads in the block of each world on a GPU. It is smaller than for a single world, so that several blocks
+share a multiprocessor."""
 
 
 def search_modes_device(
@@ -182,8 +182,8 @@ def parse_packed_result(packed: np.ndarray, size: int) -> ModeSearchResult | Non
 
 
 def mode_search_shapes(m: int, n: int) -> dict[Any, dict[str, tuple[int, ...]]]:
-    """Return the structs of ``mode_search_kernel`` in its order, each with the shapes of its arrays, for at most ``m``
-    activations and ``n`` contacts."""
+    """Return the shapes of the arrays of each struct of ``mode_search_kernel``, in the order of its parameters, for at
+    most ``m`` activations and ``n`` contacts."""
     size, constraint_capacity, force_count, base_count = m + 3 * n, 9 * n, 3 * n, 5 * n
     row_capacity = m + constraint_capacity
     shapes = {
@@ -206,7 +206,7 @@ def mode_search_shapes(m: int, n: int) -> dict[Any, dict[str, tuple[int, ...]]]:
 
 
 def relaxation_shapes(m: int, n: int) -> dict[Any, dict[str, tuple[int, ...]]]:
-    """Return the structs of ``relaxed_qp_kernel``, see ``mode_search_shapes``."""
+    """Return the shapes for ``relaxed_qp_kernel``, see ``mode_search_shapes``."""
     size, row_capacity = m + 3 * n, m + (2 + CONE_FACES) * n
     shapes = {
         **{"cost": (size, size), "root": (size, size), "leaving": (n, size), "speeds": (n,)},
@@ -217,7 +217,7 @@ def relaxation_shapes(m: int, n: int) -> dict[Any, dict[str, tuple[int, ...]]]:
 
 
 def _active_set_shapes(rows: int, base_rows: int, unknowns: int) -> dict[Any, dict[str, tuple[int, ...]]]:
-    """Return ``UnitConstraints``, ``ActiveSet`` and ``Splitting`` with their shapes, see ``active_set_shapes``."""
+    """Return the shapes of ``UnitConstraints``, ``ActiveSet`` and ``Splitting``, see ``active_set_shapes``."""
     row_shapes, state_shapes = active_set_shapes(rows, base_rows, unknowns)
     names = "rows", "projected", "multipliers", "sums", "right", "between", "step"
     shapes: dict[str, tuple[int, ...]] = {
@@ -228,7 +228,7 @@ def _active_set_shapes(rows: int, base_rows: int, unknowns: int) -> dict[Any, di
 
 
 def _cancelled_by(struct: Any, cancelled: wp.array) -> dict[str, wp.array]:
-    """Return ``cancelled`` as the field of that name if ``struct`` has it."""
+    """Return ``cancelled`` by the name of its field if ``struct`` has such a field."""
     return {"cancelled": cancelled} if struct is UnitConstraints else {}
 
 
@@ -247,8 +247,8 @@ def _launch(kernel: Any, inputs: list[Any], outputs: list[wp.array]) -> Any:
 
 
 class SearchPool:
-    """Scratch memory of ``mode_search_of_worlds_kernel``, or of ``relaxed_qp_of_worlds_kernel``, for some worlds at
-    once. More worlds are processed in several launches.
+    """Scratch memory of ``mode_search_of_worlds_kernel`` or ``relaxed_qp_of_worlds_kernel`` for a limited number of
+    worlds. More worlds are processed in several launches.
     """
 
     def __init__(self, kernel: Any, shapes: dict[Any, dict[str, tuple[int, ...]]], worlds: int, alias: str) -> None:
@@ -256,7 +256,7 @@ class SearchPool:
 
         Args:
             kernel: the kernel.
-            shapes: its structs with the shapes of their arrays, as of ``mode_search_shapes``.
+            shapes: its structs with the shapes of their arrays, see ``mode_search_shapes``.
             worlds: number of worlds that are processed at once.
             alias: name of the device.
         """

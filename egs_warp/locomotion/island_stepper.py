@@ -1,8 +1,8 @@
-"""The step of an island: bodies that may touch each other in the step, planned one by one and solved together.
+"""The step of an island, that is, of bodies that may touch each other: planned one by one and solved together.
 
-Each creature plans its own activations in a QP whose contact forces are those of the whole island, so the other bodies
-yield to it as they would in the solve. A creature that is planned later knows the activations of the earlier ones
-(Gauss-Seidel); for an earlier one, the later ones keep the activations of the previous step.
+The QP of each creature has its own activations and the contact forces of the whole island as unknowns, so the other
+bodies yield to it as in the solve. Plans are made in the order of the bodies (Gauss-Seidel): the plan of a creature
+uses the new activations of the creatures before it, and the previous activations of those after it.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ from egs_warp.locomotion.stepper import (
 from egs_warp.muscles.tension import MuscleEnergy
 
 MAX_PAIR_DEPTH = 0.01
-"""Depth of one body in another, in body heights, beyond which a step that has increased it is repeated as half steps.
-The planes of contact are those at the start of the step, which is inaccurate where a body moves far over an edge.
+"""Depth of a body in another one or in the ground, divided by the height of the shortest body of the island. A step
+that ends deeper than this and deeper than it began is repeated as half steps. The contact planes are those at the start
+of the step, which is inaccurate where a body moves far over an edge.
 """
 
 States: TypeAlias = Sequence[BodyState]
@@ -76,7 +77,7 @@ class IslandStepper:
         Args:
             members: indices of the bodies in the world, ascending.
             steppers: stepper of each of the k bodies.
-            pairs: contact between them.
+            pairs: detector of the contacts between them.
             frictions: (k, k) Coulomb coefficients between them.
         """
         self.members, self.steppers = tuple(members), tuple(steppers)
@@ -97,8 +98,8 @@ class IslandStepper:
         return tuple(stepper.factors for stepper in self.steppers)
 
     def advance(self, states: States, memories: Memories, objectives: Objectives, dt: float) -> list[list[StepReport]]:
-        """Make one step of ``dt`` s; if it does not converge, or if bodies penetrate too far, repeat it as half steps.
-        See ``WorldStepper.advance`` and ``LocomotionStepper.advance``."""
+        """Make one step of ``dt`` s. If it does not converge, or if bodies penetrate too far, repeat it as half steps;
+        see ``WorldStepper.advance`` and ``LocomotionStepper.advance``."""
         reports = self._step(states, memories, objectives, None, dt)
         if reports[0].converged:
             if not self._is_too_deep(reports, states):
@@ -128,7 +129,7 @@ class IslandStepper:
         return done
 
     def _is_too_deep(self, ends: Sequence[StepReport], states: States) -> bool:
-        """Return True if a step from ``states`` has pushed a body too deep into another or into the ground."""
+        """Return True if a step from ``states`` has moved a body too deep into another one or into the ground."""
         height = min(stepper.body.height for stepper in self.steppers)
         end, limit = np.array([report.min_gap for report in ends]), -MAX_PAIR_DEPTH * height
         if end.min() >= limit:
@@ -201,7 +202,7 @@ class IslandStepper:
         for body, memory in enumerate(memories):
             others, points = np.divmod(memory.points, pairs.point_counts[body])
             for other in np.unique(others).tolist():
-                # A negative number is a contact of another body's point, which that body remembers.
+                # A negative number is a contact of a point of the other body; the memory of that body contains it.
                 if other == 0 or (other > 0 and other - 1 in self.members):
                     chosen = others == other
                     touched = -1 if other == 0 else self.members.index(other - 1)
@@ -224,15 +225,15 @@ class IslandStepper:
         clock: StageClock,
         bodies: Sequence[int] | None = None,
     ) -> list[Plan]:
-        """Plan the activations of the ``bodies``, by default of all that have muscles, one after the other.
+        """Plan the activations of the ``bodies`` that have muscles, one after the other.
 
         Args:
             predicted: predicted end of the step; its activations and forces are replaced for each body.
-            plans: activations of all bodies before, and the contact forces that they cause.
+            plans: previous plan of each body, with the activations that it has until it is planned.
             memories: warm start of each body.
             objectives: objectives of each body.
             clock: timer of the stages.
-            bodies: bodies to be planned.
+            bodies: indices of the bodies; None for all.
         """
         plans = list(plans)
         forces = predicted.forces
@@ -248,7 +249,7 @@ class IslandStepper:
             planner = replace(stepper.planner, friction=self.contacts.friction)
             plans[body] = planner.plan(own, memories[body].activations, objectives[body], clock)
             forces = plans[body].forces
-            # The end that the last plan expects is the end that all plans expect together.
+            # The end that the last plan expects results from the activations of all plans.
             plans = [replace(plan, velocities=plans[body].velocities, forces=forces) for plan in plans]
         return plans
 
@@ -266,8 +267,8 @@ class IslandStepper:
         objectives: Objectives,
         clock: StageClock,
     ) -> tuple[Sequence[Plan], CoupledResult]:
-        """Plan again, about the solved end, the creatures whose objectives cost clearly more than ``expected`` (k,).
-        Solve again, and return the plans and the result with the lower total value; see ``LocomotionStepper.step``."""
+        """Plan the creatures whose objectives cost clearly more than ``expected`` (k,) again about the solved end, and
+        solve again. Return the plans and the result with the lower total cost; see ``LocomotionStepper.step``."""
         reached = self._values(problem, result.contacts, result, objectives)
         worse = np.flatnonzero(reached > REPLAN_FACTOR * expected + REPLAN_MARGIN)
         if len(worse) == 0:
@@ -342,9 +343,9 @@ class IslandStepper:
     ) -> tuple[np.ndarray, ContactSet]:
         """Return the indices of the contacts of a body, and these contacts with the nodes of this body alone.
 
-        A contact with another body has the face -1 minus its index in the world. Its point is (index + 1) P + p for the
-        own point p of P. For a point of the other body, it is negative and the frame is reversed, so that the same
-        forces act on this body.
+        The face of a contact with body j of the world is -1 - j. If its point is point p of the P points of this body,
+        it has the number (j + 1) P + p. If it is point p of body j, it has the number -1 - p, and its frame is
+        reversed, so that the force has the same components.
         """
         pairs, start = self.contacts.pairs, int(problem.node_starts[body])
         owned, touched = np.flatnonzero(keys[:, 0] == body), np.flatnonzero(keys[:, 1] == body)

@@ -35,9 +35,9 @@ class PredictedStep:
     forces: np.ndarray
     """(n, 3) N, contact forces in the axes of each contact."""
     body: int | None = None
-    """Index of the planned body in its island; None if the linearisation contains only this body."""
+    """Index of the planned body in its island; None if there are no other bodies."""
     other_tensions: Any = None
-    """Muscles of the other bodies of the island (``fem.island_problem.Tensions``), or None."""
+    """Muscle energies of the other bodies of the island (``fem.island_problem.Tensions``), or None."""
 
     @property
     def problem(self) -> StepProblem:
@@ -53,7 +53,7 @@ class PredictedStep:
 
     @property
     def coordinates(self) -> slice:
-        """Rows of the planned body among the coordinates of all nodes."""
+        """Coordinates of the planned body among those of all nodes."""
         return slice(None) if self.body is None else slice(3 * self.nodes.start, 3 * self.nodes.stop)
 
 
@@ -116,7 +116,7 @@ class LinearStep:
         return contacts.contact_velocities(self.velocities)
 
     def of_coordinates(self, coordinates: slice) -> LinearStep:
-        """Return the end velocity of some of the coordinates; of all of them, this object."""
+        """Return the linear step of some of the ``coordinates`` alone."""
         if coordinates == slice(None):
             return self
         return LinearStep(self.velocities[coordinates], self.torques)
@@ -167,7 +167,7 @@ class HostStepLinearizer:
         response, m = predicted.linearization, self._count
         problem, contacts = predicted.problem, response.contacts
         weight = problem.body.weight
-        # Residual without the body's muscles and contact.
+        # Residual without contact and without the muscles of the planned body.
         free = response.tangent.problem.residual(predicted.velocities, predicted.other_tensions).ravel()
         own, ends = predicted.coordinates, problem.end_positions(predicted.velocities[predicted.nodes])
         impulses = self._impulses.with_base(free[own], ends, problem.dt)
@@ -184,8 +184,8 @@ class HostStepLinearizer:
 
 def torques_of(problem: StepProblem, contacts: ContactSet, m: int, own: slice = slice(None)) -> np.ndarray:
     """Return (3, m + 3n) kg m^2/s, derivative of the angular momentum with respect to x: zero for the ``m``
-    activations, and the angular impulse of one body weight along each axis of each contact. ``own`` are the rows of the
-    body among the coordinates of the contacts' nodes."""
+    activations, and the angular impulse of one body weight along each axis of each contact. ``own`` are the coordinates
+    of the body among those of all nodes."""
     modes = problem.rotation_modes
     if own != slice(None):
         modes = np.zeros((3 * contacts.node_count, 3))

@@ -1,4 +1,4 @@
-"""Prediction of the end of a step under given activations (Eq. 12), of one body or of an island."""
+"""Prediction of the end of a step with given activations (Eq. 12), for one body or an island."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from egs_warp.locomotion.linear_step import PREDICTION_ITERATIONS
 
 
 class PredictionInputs(Protocol):
-    """Inputs of the prediction: ``StepInputs`` of one body, or ``IslandInputs``."""
+    """Inputs of the prediction: ``StepInputs`` of one body, or ``IslandInputs`` of an island."""
 
     @property
     def problem(self) -> Any:
@@ -53,7 +53,7 @@ def predict_end(
         linearizer: ``ContactLinearizer`` of the body, or ``IslandLinearizer``.
         factors: linear solver of the body, or those of the bodies of the island.
         start: inputs of the step.
-        tension: muscles of the body, or of the bodies of the island.
+        tension: muscle energy of the body, or of each body of the island.
 
     Returns:
         The contact linearisation at the predicted end, the end velocities (N, 3) m/s, and the contact forces (n, 3) N.

@@ -29,12 +29,12 @@ FRAME_RATE = 60
 REST_FRAMES = 20
 """Number of frames for which a run continues after the motion has finished."""
 _MIN_SUPPORT_COSINE = 0.7
-"""Cosine of the angle between the normal of a contact and the vertical, above which another body supports the body."""
+"""Minimum cosine of the angle between the normal and the vertical at a contact where another body supports the body."""
 
 
 Kicks: TypeAlias = Callable[[float, float], np.ndarray | None]
-"""Function of time and step size, s, that returns the velocities (N, 3) m/s that external pushes add to the nodes at
-the start of the step, or None."""
+"""Function of the time and the step size, in seconds. It returns the velocities (N, 3) m/s that external pushes add to
+the nodes at the start of the step, or None."""
 
 
 class Motion(Protocol):
@@ -89,7 +89,7 @@ class BodyRun:
         resume: Path | None = None,
         kicks: Kicks = lambda time, dt: None,
     ) -> None:
-        """Begin at ``start``; the arguments are described at ``rollout_steps``."""
+        """Begin at ``start``; arguments as for ``rollout_steps``."""
         self.stepper, self._motion, self._kicks = stepper, motion, kicks
         self._up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
         self.state, self.memory = start, stepper.initial_memory()
@@ -139,7 +139,7 @@ class BodyRun:
         return self.state.with_velocity_kick(self._kick), done
 
     def finish_step(self, done: Sequence[StepReport]) -> None:
-        """Continue from the end of the step, and record ``done``, the reports of the parts into which it was
+        """Continue from the end of a step and record its reports ``done``, one for each part into which it was
         divided."""
         self.state, self.memory = done[-1].state, WarmStart.from_report(done[-1])
         self.reports.extend(done)
@@ -157,7 +157,7 @@ class BodyRun:
 
 @dataclass(frozen=True)
 class StepRequest:
-    """A step that a run needs."""
+    """Inputs of a step that a run requests from its caller."""
 
     state: BodyState
     """State at the start, after external pushes."""
@@ -184,11 +184,12 @@ class StepRequest:
 
 
 RunSteps: TypeAlias = Generator[StepRequest, list[StepReport], T]
-"""A run that yields each step that it needs, receives its reports, and returns its result."""
+"""Generator of a run: it yields the request for each step, receives the reports of the step, and returns the result of
+the run."""
 
 
 def run_with(stepper: LocomotionStepper, steps: RunSteps[T]) -> T:
-    """Make the ``steps`` of a run with ``stepper`` and return the result of the run."""
+    """Compute the ``steps`` of a run with ``stepper`` and return the result of the run."""
     try:
         request = next(steps)
         while True:
@@ -244,7 +245,7 @@ def rollout_steps(
     progress: Callable[[int], object] = lambda frame: None,
 ) -> RunSteps[RolloutResult]:
     """Run ``frames`` frames of ``motion`` from ``start``. The run ends earlier if the motion has ``finished`` for
-    ``REST_FRAMES`` frames, or if a step cannot be solved. The caller makes the steps (``run_with``).
+    ``REST_FRAMES`` frames, or if a step cannot be solved. The caller computes the steps, for example with ``run_with``.
 
     Args:
         stepper: stepper of the body.
@@ -293,8 +294,8 @@ def rollout_steps(
 
 
 def _without_pushes(report: StepReport, up: np.ndarray) -> StepReport:
-    """Return ``report`` without the contacts with other bodies that do not support the body against gravity, which is
-    opposite to ``up`` (3,): a motion must not take the body that pushes it for its ground."""
+    """Return ``report`` without the contacts with other bodies that push the body sideways or down, for the unit vector
+    ``up`` (3,): a motion must not treat a body that pushes it as its ground."""
     contacts = report.contacts
     kept = (contacts.faces >= 0) | (contacts.axes[:, 0] @ up > _MIN_SUPPORT_COSINE)
     if kept.all():

@@ -1,4 +1,4 @@
-"""Linear step and cost of a step on PyTorch tensors, in one world or in many (Eq. 7, 13).
+"""Linear step and cost of a step on PyTorch tensors, for one world or many (Eq. 7, 13).
 
 In the shapes below, "..." is the world axis, or nothing for one world. ``device_plan`` records these operations as CUDA
 graphs of one world; ``batch_plan`` applies them to many worlds.
@@ -27,7 +27,8 @@ def synergy_impulses(
     Args:
         rows: (M, N) difference rows of the segments.
         members: (M, m) membership matrix of the synergies.
-        segment_forces: (..., M, 3) N, forces by which the segments at their bounds pull their ends together.
+        segment_forces: (..., M, 3) N, forces with which segments pull their ends together at the bounds of their
+            activations.
         dt: step size, s.
     """
     group_forces = (segment_forces[..., None] * members[:, None, :]).flatten(-2)
@@ -82,14 +83,14 @@ class WeightedRows(BatchedRecord):
         return (residual.mT @ residual).add_(dense.mT @ dense)
 
     def value(self, velocities: torch.Tensor) -> torch.Tensor:
-        """Return (...,) (m/s)^2, the weighted squares at end ``velocities`` (..., 3N) m/s."""
+        """Return the sums of weighted squares (...,) (m/s)^2 at the end ``velocities`` (..., 3N) m/s."""
         residual = self.entries * velocities.gather(-1, self.indices) - self.entry_targets
         dense = (self.rows @ velocities[..., None])[..., 0] - self.targets
         return 0.5 * (residual.square().sum(-1) + dense.square().sum(-1))
 
 
 def rows_of(objectives: Sequence[Objective], size: int) -> list[np.ndarray]:
-    """Return the arrays of ``WeightedRows`` in one world for end velocities (size,)."""
+    """Return the arrays of the ``WeightedRows`` of one world, for end velocities (size,)."""
     single, dense_rows, dense_targets = [], [np.zeros((0, size))], [np.zeros(0)]
     for objective in objectives:
         root, rows = np.sqrt(2.0 * objective.weight), objective.rows
@@ -123,8 +124,8 @@ def add_effort(
 def add_activation_cost(
     form: torch.Tensor, diagonal: torch.Tensor, linear: torch.Tensor, constant: torch.Tensor, squared_work: torch.Tensor
 ) -> None:
-    """Add the cost of the size and the change of activations and of the work of their muscles to a quadratic form, as
-    ``StepPlanner.program`` does.
+    """Add the costs of the size and the change of the activations, and of the work of their muscles, to a quadratic
+    form, as ``StepPlanner.program`` does.
 
     Args:
         form: (..., k + 1, k + 1) quadratic form of the cost, updated in place.

@@ -90,7 +90,7 @@ class Trajectory:
     contact_weights: np.ndarray
     """(C, 4) barycentric weights of the contact point."""
     contact_plane: np.ndarray
-    """(C,) int32, row of ``planes``; 0 is the ground, flat or not. -1 - k is a contact with body k of the world."""
+    """(C,) int32, row of ``planes``; 0 is the ground, flat or not; -1 - k for a contact with body k of the world."""
     contact_normal: np.ndarray
     """(C, 3) unit normal of the contact plane, or of uneven ground below the contact at the start of the step."""
     contact_force: np.ndarray

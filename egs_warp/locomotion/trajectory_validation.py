@@ -59,7 +59,7 @@ _INDICES = {
 }
 """Extent below which all values of each integer array must be."""
 MAX_BODIES = 10_000
-"""Maximum number of bodies of a world; contacts with them have negative values of ``contact_plane``."""
+"""Maximum number of bodies of a world; ``contact_plane`` is -1 - k for contacts with body k."""
 _POSITIVE = ("node_mass", "height", "metres_per_unit", "ground_spacing", "dt", "relative_stiffness")
 _MAY_BE_NAN = ("planned_com", "min_gap")
 """Arrays that may contain NaN: where there is no plan or no contact point."""

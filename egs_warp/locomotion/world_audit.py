@@ -1,6 +1,7 @@
-"""Audit of a world of several bodies: residuals of the equations between its bodies, from their trajectories alone and,
-for gaps and penetration, from the contact points and level sets of their shapes. It shares no code with the solver
-(docs/concepts/bodies.md).
+"""Audit of a world: residuals of the equations that couple its bodies (docs/concepts/bodies.md).
+
+They are computed from the trajectories of the bodies and, for gaps and penetration, from their contact points and level
+sets, without any code of the solver.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ from egs_warp.meshing.level_set import LevelSet
 from egs_warp.short_repr import short_repr
 
 _SAME_TIME = 1e-6
-"""Maximum difference of two equal times, divided by the smallest step. Bodies that are apart may be halved differently,
-so their times differ by rounding."""
+"""Maximum difference of two equal times, divided by the smallest step. The steps of bodies that are apart may be halved
+differently, so their times differ by rounding."""
 _MIN_SLOPE = 0.5
 """Lower bound of the slope of a level set in gaps (docs/concepts/bodies.md)."""
 _POINTS_AT_A_TIME = 256
-"""Number of points that are located in the tetrahedra of a body at a time, which bounds the memory."""
+"""Number of points that are located in the tetrahedra of a body at once. It bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,8 @@ class ContactShape:
 
     @classmethod
     def of(cls, geometry: ContactGeometry, level_set: LevelSet, rest_positions: np.ndarray) -> Self:
-        """Return the shape of a body with the contact points of ``geometry``, and cage nodes at ``rest_positions`` (N,
-        3) m in the frame of its level set."""
+        """Return the shape of a body with the contact points of ``geometry`` and the ``level_set``, in whose frame the
+        nodes of the cage are at ``rest_positions`` (N, 3) m."""
         return cls(
             geometry.tet_from_point,
             geometry.weights,
@@ -79,8 +80,8 @@ class ContactShape:
     def signed_distance(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the values (n,) m and gradients (n, 3) of the level set at ``points`` (n, 3) m of the rest shape.
 
-        Beyond the outermost half cells of the lattice, the value is that at the nearest point of the remaining lattice
-        plus the distance to this point.
+        Outside the lattice without its outermost half cells, the value is that at the nearest point inside plus the
+        distance to this point.
         """
         cells = (points - self.origin) / self.spacing
         inner = np.clip(cells, 0.5, np.array(self.coefficients.shape) - 1.5)
@@ -109,15 +110,15 @@ class ContactShape:
 
 @dataclass(frozen=True)
 class PairAudit:
-    """Largest errors over all steps of the contacts between two bodies, in units of the weight m g of the lighter and
-    the height H of the lower body; and the work of the contacts."""
+    """Largest errors of the contacts between two bodies over all steps, and the work of these contacts. m g is the
+    weight of the lighter body, and H the height of the shorter one."""
 
     bodies: tuple[int, int]
     """Indices a < b of the bodies in the world."""
     contacts: int
     """Number of contacts, summed over the steps."""
     unmatched_contacts: int
-    """Number of records of a contact to which the other body has no record with exactly the opposite force."""
+    """Number of contact records without a record of exactly the opposite force in the other body."""
     force_residual: float
     """Sum of the forces on both bodies in a step, divided by m g."""
     torque_residual: float
@@ -130,23 +131,23 @@ class PairAudit:
     complementarity_gap: float
     """Normal force times recomputed gap at the end of the step, divided by m g H."""
     gap_error: float
-    """Difference between stored and recomputed gap at the end of a step, divided by H."""
+    """Difference between the stored and the recomputed gap at the end of a step, divided by H."""
     normal_error: float
-    """Difference between stored and recomputed unit normal."""
+    """Difference between the stored and the recomputed unit normal."""
     penetration: float
     """Depth of the deepest contact point of one body in the other, divided by H."""
     friction_work: float
-    """J, work of the tangential forces on the relative motion; it is negative."""
+    """J, work of the tangential forces on the relative motion; at most 0 up to rounding."""
     contact_work: float
     """J, work of the normal forces on points that approach the other body."""
     push_out_work: float
-    """J, work of the normal forces on points that leave the other body."""
+    """J, work of the normal forces on points that move away from the other body."""
 
 
 @dataclass(frozen=True)
 class WorldAudit:
     """Largest errors of a world over all steps, and those of each pair of bodies that touched or whose boxes
-    overlapped. M and H are the mass of all bodies and the height of the tallest."""
+    overlapped. M is the mass of all bodies, and H the height of the tallest one."""
 
     momentum_residual: float
     """Change of the linear momentum minus the impulses of gravity, ground, pushes and drag, in M sqrt(g H)."""
@@ -163,12 +164,12 @@ class WorldAudit:
 def audit_world(
     trajectories: Sequence[Trajectory], shapes: Sequence[ContactShape], *, frictions: np.ndarray | None = None
 ) -> WorldAudit:
-    """Recompute every error between the bodies of a world.
+    """Compute the errors of the contacts between the bodies of a world, and of its momentum balances.
 
     Args:
         trajectories: trajectory of each of the k bodies, in the order of the world.
         shapes: shape of each body.
-        frictions: (k, k) Coulomb coefficients between the bodies; None takes the geometric mean of their coefficients
+        frictions: (k, k) Coulomb coefficients between the bodies; None uses the geometric mean of their coefficients
             with the ground.
     """
     if frictions is None:
@@ -192,7 +193,7 @@ def audit_world(
 
 @dataclass(frozen=True)
 class _Pair:
-    """Two bodies of a world. Tuples contain the value of body a and that of body b."""
+    """Two bodies of a world, a and b. Tuples contain one value for each."""
 
     bodies: tuple[int, int]
     trajectories: tuple[Trajectory, ...]
@@ -240,7 +241,7 @@ class _Pair:
 
     @property
     def height(self) -> float:
-        """Height of the lower body, m."""
+        """Height of the shorter body, m."""
         return min(t.height for t in self.trajectories)
 
     @cached_property
@@ -268,7 +269,7 @@ class _Pair:
         return np.concatenate(found)
 
     def audit(self, friction: float) -> PairAudit:
-        """Compute every error, for the Coulomb coefficient ``friction`` of the pair."""
+        """Compute the errors, with the Coulomb coefficient ``friction`` of the pair."""
         (t, u), (i, j) = self.trajectories, self.matches.T
         energy = self.weight * self.height
         forces, normals = t.contact_force[i], t.contact_normal[i]
@@ -355,7 +356,7 @@ class _Pair:
 
 def _depth(points: np.ndarray, shape: ContactShape, tets: np.ndarray, positions: np.ndarray) -> float:
     """Return the depth, in metres, of the deepest of the ``points`` (n, 3) m in a body with nodal ``positions`` (N, 3)
-    m. Points outside a cage of several tetrahedra, which encloses the body, are not in the body."""
+    m. Points outside a cage of several tetrahedra are outside the body, which it encloses."""
     if len(points) == 0:
         return 0.0
     corners = positions[tets]
@@ -403,8 +404,8 @@ def _common_states(t: Trajectory, u: Trajectory) -> tuple[np.ndarray, np.ndarray
 
 
 def _world_impulses(trajectories: Sequence[Trajectory]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the changes (n, 3) of the momenta of the world between common times minus the impulses of gravity, ground,
-    pushes and drag: linear in kg m/s, and angular about the origin in kg m^2/s."""
+    """Return the changes (n, 3) of the momenta of the world between times that all trajectories contain, minus the
+    impulses of gravity, ground, pushes and drag: linear in kg m/s, and angular about the origin in kg m^2/s."""
     first = np.arange(len(trajectories[0].time))
     for other in trajectories[1:]:
         first = np.intersect1d(first, _common_states(trajectories[0], other)[0])
@@ -419,7 +420,7 @@ def _world_impulses(trajectories: Sequence[Trajectory]) -> tuple[np.ndarray, np.
 
 
 def _impulses(t: Trajectory) -> np.ndarray:
-    """Return (F, 6), the changes of the momenta of a body in each step without the impulses of gravity, ground, pushes
+    """Return (F, 6), the changes of the momenta of a body in each step minus the impulses of gravity, ground, pushes
     and drag: linear in kg m/s, and angular about the origin in kg m^2/s."""
     on_ground = t.contact_plane >= 0
     linear, angular = momentum_residuals(replace(t, **{name: getattr(t, name)[on_ground] for name in CONTACTS}))

@@ -15,7 +15,7 @@ from egs_warp.locomotion.world_stepper import WorldStepper
 
 
 def world_steps(bodies: Sequence[SoftBody], step: float | None = None) -> tuple[float, int]:
-    """Return the size of a solver step in seconds, and the number of steps in a frame: those of the body with the
+    """Return the size of a solver step in seconds, and the number of steps in a frame, for the body that needs the
     shortest steps (``solver_steps``)."""
     count = max(solver_steps(body, step)[1] for body in bodies)
     return max(1.0 / FRAME_RATE, step or 0.0) / count, count
@@ -68,8 +68,7 @@ def roll_out_world(
 
 
 def _try_advance(advance: Callable[[], list[list[StepReport]]]) -> list[list[StepReport]]:
-    """Return the reports of a step for each body; an empty list if the step of a body cannot be solved, not even a part
-    of it."""
+    """Return the reports of a step for each body; an empty list if no part of the step of one body can be solved."""
     try:
         done = advance()
     except (UnsolvableStepError, np.linalg.LinAlgError):

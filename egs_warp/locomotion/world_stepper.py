@@ -1,7 +1,7 @@
 """The stepper of a world of several bodies on a common ground (docs/concepts/bodies.md).
 
-Bodies that may touch each other in a step form an island. An island of one body is stepped by its own
-``LocomotionStepper``, a larger one by an ``IslandStepper``.
+Bodies that may touch each other in a step form an island. A body that is an island of its own is stepped by its
+``LocomotionStepper``, a larger island by an ``IslandStepper``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from egs_warp.meshing.level_set import LevelSet
 from egs_warp.short_repr import short_repr
 
 _SLEEP_SPEED = 1e-6
-"""Maximum speed of the nodes of a prop that falls asleep, in sqrt(g H)."""
+"""Maximum velocity component of the nodes of a prop that falls asleep, in sqrt(g H)."""
 _SLEEP_STEPS = 20
 """Number of successive steps below ``_SLEEP_SPEED`` after which a prop falls asleep."""
 
@@ -50,7 +50,7 @@ class WorldStepper:
 
         Args:
             bodies: the bodies; the Coulomb coefficient of each with the ground is that of its contact geometry.
-            frictions: (k, k) Coulomb coefficients between the bodies, symmetric; None takes the geometric mean of their
+            frictions: (k, k) Coulomb coefficients between the bodies, symmetric; None uses the geometric mean of their
                 coefficients with the ground.
         """
         self.bodies = tuple(bodies)
@@ -64,7 +64,7 @@ class WorldStepper:
             ],
             device="cpu",
         )
-        """Contact between the bodies."""
+        """Detector of the contacts between the bodies."""
         self._islands: dict[tuple[int, ...], IslandStepper] = {}
         self._quiet_steps = np.zeros(len(bodies), int)
         self._last_reports: list[StepReport | None] = [None] * len(bodies)
@@ -93,8 +93,8 @@ class WorldStepper:
             the state at the end and the warm start of the next step (``WarmStart.from_report``). The contacts of a
             report include those with other bodies (``IslandStepper``); their faces are negative.
 
-        Props that have been at rest for some steps sleep until a body that is awake comes close: they are not moved,
-        and their contact forces stay.
+        Props that have been at rest for some steps sleep until a body that is awake comes close: they do not move, and
+        their contact forces do not change.
         """
         done: list[list[StepReport]] = [[] for _ in self.bodies]
         for members in self.islands(states, dt):
@@ -118,8 +118,8 @@ class WorldStepper:
     def _asleep(
         self, members: Sequence[int], states: Sequence[BodyState], memories: Sequence[WarmStart], dt: float
     ) -> list[StepReport] | None:
-        """Return the reports of an island whose bodies all sleep, with the last contact forces; None if one is awake or
-        its state is not the one in which it fell asleep."""
+        """Return the reports of an island whose bodies all sleep, with their last contact forces. Return None if a body
+        is awake, or if its state is not the one in which it fell asleep."""
         reports = []
         for body in members:
             last, state = self._last_reports[body], states[body]
@@ -146,8 +146,8 @@ class WorldStepper:
             self._last_reports[body] = last
 
     def islands(self, states: Sequence[BodyState], dt: float) -> list[tuple[int, ...]]:
-        """Return the islands of a step of ``dt`` s: bodies whose inflated boxes overlap at the end of a ballistic
-        motion, or are connected by such overlaps; in the order of their first bodies."""
+        """Return the islands of a step of ``dt`` s, in the order of their first bodies. An island is a set of bodies
+        that overlaps of their inflated boxes at the end of a ballistic motion connect."""
         ends = [
             StepProblem(body.stepper.body, state, dt).ballistic_positions
             for body, state in zip(self.bodies, states, strict=True)

@@ -1,4 +1,4 @@
-"""Objectives of the soles of a body in the air: they are moved to where the body lands, and turned flat."""
+"""Objectives of the soles of a body in the air: move to their places in the landing pose, and turn a base flat."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from egs_warp.motions.stance import BalanceController, sole_shares
 
 SWING_WEIGHT, BASE_SWING_WEIGHT = 5.0, 1.0
 """Weights of the velocities of the soles in the air, for feet on legs and for a single base. Without these objectives,
-the soles land 0.03 body heights short, and a body with little support in front falls over them. A base is stiff: with a
-weight of 5, a monkey's jump takes 50 % more work and does not land better."""
+the soles land 0.03 body heights short, and a body with little support in front falls forward. A base is stiff: with a
+weight of 5, the jump of a monkey takes 50 % more work and does not land better."""
 BASE_TILT_WEIGHT = 5.0
-"""Weight of the tilt rate of a single base in the air. A base on a slender stem tilts while it is moved forward: the
-base of a lamp would land on its rear rim, tilted by 35 degrees."""
+"""Weight of the tilt rate of a single base in the air. A base on a slender stem tilts while it is moved forward.
+Without this objective, the base of a lamp lands on its rear rim, tilted by 35 degrees."""
 _MIN_INERTIA_RATIO = 1e-6
 """Minimum ratio of the smallest to the largest principal moment of inertia of a sole that spans an area."""
 
 
 @dataclass(frozen=True)
 class AirborneSoles:
-    """Soles of a body in the air, one for each foot on a leg, or the base, and the weights of their objectives."""
+    """Soles of a body in the air and the weights of their objectives. There is one sole for each foot on a leg, or the
+    base alone."""
 
     parts: tuple[BodyPart, ...]
     swing_weight: float
@@ -37,7 +38,7 @@ class AirborneSoles:
 
     @classmethod
     def of(cls, stance: Stance, feet: Sequence[Foot], *, on_legs: bool) -> AirborneSoles:
-        """Return the soles of the body that stands at ``stance``: its base, unless its ``feet`` are on legs."""
+        """Return the soles of the body of ``stance``: those of its ``feet`` if they are ``on_legs``, else its base."""
         body = stance.body
         if on_legs:
             return cls(tuple(BodyPart.of(body, "sole", foot.sole) for foot in feet), SWING_WEIGHT, 0.0)
@@ -49,14 +50,15 @@ class AirborneSoles:
     def objectives(
         self, controller: BalanceController, state: BodyState, pose: np.ndarray, rate: float, share: float
     ) -> list[AnyObjective]:
-        """Return the objectives that move the soles to their positions in a pose, and tilt them to their orientations.
+        """Return the objectives that move the soles to their positions in the pose of the landing and tilt them to
+        their orientations there.
 
         Args:
-            controller: balance controller, whose pose it is.
+            controller: balance controller of the standing body.
             state: current state.
-            pose: (3, 3) pose of the landing.
+            pose: (3, 3) rotation of the standing body to its landing pose.
             rate: 1/s, rate at which the pose is approached.
-            share: factor on the weights.
+            share: factor of the weights.
         """
         body, arms, level = controller.body, controller.arms, Coordinates(controller.ground.axes[:2], False)
         com, about = body.centre_of_mass(state.positions), Coordinates(np.eye(3), True)
@@ -72,7 +74,7 @@ class AirborneSoles:
 
 
 def _normal(controller: BalanceController, sole: BodyPart, points: np.ndarray) -> np.ndarray:
-    """Return the unit normal (3,) of a ``sole`` with nodes at ``points`` (N, 3): the up axis in the best-fit rotation
-    from the standing sole."""
+    """Return the unit normal (3,) of a ``sole`` of a body with nodes at ``points`` (N, 3): the up axis, rotated by the
+    best-fit rotation of the sole from its standing shape."""
     before, after = (x[sole.nodes] - sole.centre(x) for x in (controller.arms, points))
     return kabsch_rotation(sole.masses, before, after) @ controller.ground.axes[2]

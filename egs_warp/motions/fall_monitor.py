@@ -1,5 +1,4 @@
-"""Detection of falls from tilt, contacts and capture point; a fall ends the motion, or starts the attempt to get
-up."""
+"""Detection of falls from tilt, contacts and capture point. A fall ends the motion or starts an attempt to get up."""
 
 from __future__ import annotations
 
@@ -32,10 +31,11 @@ FALLEN_TIME = 0.5
 """Time in sqrt(H / g) for which a body on the ground must be tilted or lying to be considered fallen. In free fall, it
 descends by H / 8 in this time; brief contacts during a landing are shorter."""
 LOST_TIME, LOST_DISTANCE = 1.0, 0.02
-"""Time in sqrt(H / g), longer than a swing of a walk, and distance in body heights for which and by which the capture
-point must be outside the support for the body to be falling. The distance grows by a factor of four in this time."""
+"""A body is tipping over if its capture point has been outside the support by more than LOST_DISTANCE, in body heights,
+for LOST_TIME, in sqrt(H / g). This time is longer than a swing of a walk; in it, the distance grows by a factor of four
+if the centre of mass is at H / 2."""
 _MIN_HEIGHT = 0.1
-"""Minimum height of the centre of mass in body heights for which the capture point is computed."""
+"""Lower bound of the height of the centre of mass above the contacts, in body heights, in the capture point."""
 
 
 class FallMonitor:
@@ -75,9 +75,9 @@ class FallMonitor:
 
     @property
     def fall_note(self) -> str | None:
-        """Description of the fall at the end of the run, including one that has only begun: the capture point has been
-        outside the support for ``LOST_TIME``, so that the body tips over if the run continues. None if the body has not
-        fallen."""
+        """Description of the fall at the end of the run; None if there is none. It includes a fall that has only begun:
+        the capture point has been outside the support for ``LOST_TIME``, so the body would tip over if the run
+        continued."""
         if self.fallen is not None or self._lost_time < self._lost_time_limit:
             return self.fallen
         return f"tipping over, with its capture point outside its feet, at {self.time:.2f} s"
@@ -127,7 +127,8 @@ class FallMonitor:
             self.fallen = description or f"the body has not got up by {self._last_time:.2f} s"
 
     def _is_outside_support(self, state: BodyState, report: StepReport) -> bool:
-        """Return True if the capture point of a body on the ground is outside the hull of the contacts."""
+        """Return True if the body touches the ground and its capture point is more than ``LOST_DISTANCE`` outside the
+        convex hull of the contacts."""
         contacts, body = report.contacts, self._body
         if contacts.count == 0 or not np.isfinite(state.velocities).all():
             return False

@@ -37,7 +37,7 @@ _SIDE_HEIGHT, _MIDDLE_FRACTION, _BLEND_FRACTION = 0.3, 0.2, 0.6
 the middle strip that belongs to neither foot, and width over which the sides blend, both as fractions of the half
 width."""
 _HELD_LOAD = 0.1
-"""Load of a foot, as a fraction of the body weight, from which on it is kept from sliding with the full weight."""
+"""Load of a foot, as a fraction of the body weight, above which its no-slip objective has its full weight."""
 FIRST_FOOT_ANGLE = np.radians(15.0)
 """Maximum angle to the right of straight ahead of a foot that can be the first, radians."""
 
@@ -202,11 +202,11 @@ def foot_loads(feet: Sequence[Foot], report: StepReport | None, weight: float) -
 def no_slip_feet(
     body: SoftBody, feet: Sequence[Foot], contacts: ContactSet, loads: np.ndarray, axes: np.ndarray, weight: float
 ) -> list[Objective]:
-    """Return an objective for each loaded foot that keeps it from sliding but lets it turn about its centre of
-    pressure: zero mean velocity of its contacts.
+    """Return one objective for each loaded foot: zero sliding velocity at its centre of pressure. The foot may turn
+    about this point.
 
-    A foot that is being unloaded has the same weight as any other until it carries less than ``_HELD_LOAD``. The sole
-    is strained, and its strain would otherwise be released by sliding.
+    The weight of the objective decreases only when the foot carries less than ``_HELD_LOAD``. A sole is strained, and a
+    foot that is being unloaded would otherwise slide until the strain is released.
 
     Args:
         body: the body.
@@ -215,7 +215,7 @@ def no_slip_feet(
         loads: (n,) load of each contact by which the mean is weighted, as a fraction of the body weight; 0 excludes a
             contact.
         axes: (2, 3) unit vectors along the ground.
-        weight: weight of one foot.
+        weight: weight of the objective of one foot.
     """
     objectives = []
     owner = foot_of_contact(feet, contacts)

@@ -52,11 +52,11 @@ def drift(off: np.ndarray, push: np.ndarray, growth: float) -> np.ndarray:
 
 
 def momentum_as_velocity(momentum: np.ndarray, mass: float, height: float) -> np.ndarray:
-    """Return the velocity (2,) in m/s along the ground by which an angular ``momentum`` (3,) kg m^2/s about the centre
-    of mass, ground axes, contributes to the angular momentum about a point on the ground.
+    """Return the velocity (2,) m/s of the centre of mass along the ground that contributes as much to the angular
+    momentum about a point on the ground as the angular momentum about the centre of mass does.
 
     Args:
-        momentum: angular momentum.
+        momentum: (3,) kg m^2/s, angular momentum about the centre of mass, ground axes.
         mass: mass of the body, kg.
         height: height of the centre of mass above the point, m.
     """

@@ -1,7 +1,7 @@
 """Motions towards other bodies of a world: ``face NAME``, ``walk to NAME`` and ``jump to NAME``.
 
-Their targets are computed from the position of the other body when the motion starts. Each of them is a motion of the
-registry with a measured target: a turn, a walk and a jump.
+They are a turn, a walk and a jump of the registry. Their targets are computed from the position of the other body when
+the motion starts.
 """
 
 from __future__ import annotations
@@ -23,28 +23,29 @@ from egs_warp.motions.sequence import BodyMotion, Stance
 from egs_warp.motions.stand import StandFor
 
 TOWARDS = {"face": "turn 90", "walk to": "walk to 1,0", "jump to": "jump 1"}
-"""Motion of the registry behind each motion towards a body."""
+"""Motion of the registry on which each motion towards a body is based."""
 _CLEARANCE = 0.1
-"""Distance from the other body at which a walk ends, in body heights."""
+"""Gap to the other body at which a walk ends, in body heights."""
 _MIN_TURN = np.radians(3.0)
-"""Angle to the other body below which ``face`` only stands, radians."""
+"""Angle to the other body, in radians, below which ``face`` is a stand instead of a turn."""
 _NO_TURN_TIME = 0.1
-"""Time for which it stands then, s."""
+"""Duration of this stand, s."""
 _TIME_FACTOR = 2.0
-"""Ratio of the time limit to that of the same motion at the start of the run, because the other body may move away."""
+"""Ratio of the time limit to the limit that the motion would have at the start of the run. It exceeds 1 because the
+other body may move away."""
 
 
 @dataclass(frozen=True)
 class OtherBody:
-    """Another body of the world, whose position a motion measures when it starts."""
+    """Another body of the world. A motion measures its position at the time at which it starts."""
 
     body: SoftBody
     state: Callable[[], BodyState]
     """Function that returns its current state."""
 
     def place(self, stance: Stance) -> tuple[np.ndarray, float]:
-        """Return the centre of mass (2,) m in the ground frame of ``stance``, and the distance in metres between the
-        centres of the two bodies at which they touch."""
+        """Return the centre of mass (2,) m in the ground frame of ``stance``, and the approximate distance, in metres,
+        between the centres of the two bodies at which they touch."""
         positions = self.state().positions
         local = stance.ground.local(positions)
         return self.body.centre_of_mass(local)[:2], _radius(stance.ground.local(stance.standing)) + _radius(local)
@@ -56,11 +57,11 @@ def _radius(local: np.ndarray) -> float:
 
 
 def script_among(text: str, others: Mapping[str, OtherBody], stance: Stance) -> Script:
-    """Parse motions into a script, as ``script.motion`` does, with motions towards ``others`` by their names.
+    """Parse motions, including those towards ``others``, into a script; see ``script.motion``.
 
     Args:
         text: the motions.
-        others: the other bodies of the world.
+        others: the other bodies of the world by their names.
         stance: stance of the body at the start, from which the time limits are computed.
 
     Raises:
@@ -99,7 +100,8 @@ def _pieces(text: str) -> list[str]:
 
 
 def _split(piece: str) -> tuple[str | None, str, str]:
-    """Return the kind, the name of the other body and the rest of a motion towards a body; None for other motions."""
+    """Return the kind, the name of the other body and the remaining text of a motion towards a body; the kind of other
+    motions is None."""
     for kind in TOWARDS:
         match = re.fullmatch(rf"{kind}\s+([A-Za-z_][\w-]*)(?![\w=-])\s*(.*)", piece, re.IGNORECASE)
         if match is not None and not match[2].startswith("="):
@@ -108,7 +110,7 @@ def _split(piece: str) -> tuple[str | None, str, str]:
 
 
 def _with_target(kind: str, base: MotionRequest, target: np.ndarray, touching: float, height: float) -> MotionRequest:
-    """Return the request for the motion of ``kind`` to a body at ``target`` (2,) m, forward and to the left."""
+    """Return the request for the motion of ``kind`` towards a body ``target`` (2,) m ahead and to the left."""
     distance = float(np.linalg.norm(target))
     if kind == "face":
         values = {"heading_degrees": float(np.degrees(np.arctan2(target[1], target[0])))}
@@ -122,8 +124,8 @@ def _with_target(kind: str, base: MotionRequest, target: np.ndarray, touching: f
 
 
 def _begin(kind: str, base: MotionRequest, other: OtherBody, asked: dict[str, float], stance: Stance) -> BodyMotion:
-    """Begin the motion of ``kind`` towards ``other``. Its measured target is stored in ``asked``; a jump, which the
-    other body may stop, is not judged by its distance."""
+    """Begin the motion of ``kind`` towards ``other`` and store its target in ``asked``, by which the result is
+    judged. A jump has no such target, because the other body may stop it."""
     target, touching = other.place(stance)
     height = stance.body.height
     request = _with_target(kind, base, target, touching, height)

@@ -459,8 +459,8 @@ class Walk:
         )
 
     def _no_slip_objectives(self, report: StepReport, elapsed: float) -> list[Objective]:
-        """Return the objectives of zero sliding velocity at standing feet, and at lifted feet until they move forward:
-        one for the contacts, and one for each foot."""
+        """Return the objectives of zero sliding velocity of standing feet, and of lifted feet until they move forward:
+        one for all contact points, and one for each foot."""
         contacts, control = report.contacts, self.control
         ahead = self.swinging if elapsed > self.gait.transfer_start_time else ()
         stands = ~np.isin(foot_of_contact(self.feet, contacts), ahead)

@@ -45,7 +45,7 @@ class WalkControl:
     unload: float = 10.0
     """Weight of the load on the contact points of a lifted foot."""
     slip: float = 100.0
-    """Weight of the sliding velocity of a standing foot, the mean over its contacts."""
+    """Weight of the sliding velocity of a standing foot at its centre of pressure."""
     balance: float = 3.0
     """Shift of the centre of pressure in metres per metre of error of the divergent component of motion."""
     turn_rate: float = 4.0

@@ -71,8 +71,8 @@ class WalkPosture(Protocol):
     swing_weight: float
     """Weight of the velocity of a swinging sole."""
     stance_weight: float
-    """Weight of zero slip at standing contact points; each point is scaled by its share of the load. The slip of a
-    whole foot has a weight of its own, ``WalkControl.slip``."""
+    """Weight of zero slip at standing contact points; each point is scaled by its share of the load.
+    ``WalkControl.slip`` is the weight of the mean slip of a foot."""
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
         """Return the target nodes (N, 3), ground coordinates.

@@ -1,4 +1,4 @@
-"""The vector environment: spaces, episodes, rewards, and physics equal to that of a single stepper."""
+"""The vector environment: spaces, episodes and rewards, and steps that equal those of a single stepper."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_bad_arguments_are_one_line() -> None:
     creature = coarse_pawn()
     with pytest.raises(ArgumentError, match=r"^num_envs 0: give a whole number of at least 1$"):
         CreatureVectorEnv(creature, 0)
-    with pytest.raises(ArgumentError, match=r"^frictions: 1 are given; give one for each of 2 worlds$"):
+    with pytest.raises(ArgumentError, match=r"^frictions: the length is 1; give one for each of 2 worlds$"):
         CreatureVectorEnv(creature, 2, frictions=[0.5])
     with pytest.raises(UserError, match=r"^actions 'target' are not known \(did you mean 'targets'\?\)"):
         CreatureVectorEnv(creature, 2, actions="target")

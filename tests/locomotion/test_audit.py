@@ -74,7 +74,8 @@ def test_a_run_that_slides_passes() -> None:
 
 
 def test_contacts_with_other_bodies_are_external_forces() -> None:
-    """Their forces enter the momenta; their slip and gap are unknown, so friction and complementarity skip them."""
+    """The momentum and energy balances contain their forces. Their slip and gap are unknown, so ``friction_gap`` and
+    ``complementarity_gap`` omit them."""
     t = slide().trajectory()
     others = replace(t, contact_plane=np.full_like(t.contact_plane, -3))
     sliding_on_ground, pushed = audit(t), audit(others)

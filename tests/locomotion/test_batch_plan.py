@@ -1,4 +1,4 @@
-"""Planned steps of many worlds: each world has the steps of a single stepper, independent of the other worlds."""
+"""Planned steps of many worlds: each world equals a single stepper, independently of the other worlds."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ from egs_warp.pipelines.creature import Creature, initial_stance
 from tests.support.creatures import coarse_pawn, on_its_rim
 
 FRICTIONS = (0.8, 0.4, 0.6)
-"""With 1.2, the plan of a body that is pushed down amplifies rounding: a start that differs by 1e-15 m changes the
+"""At 1.2, the plan of a body that is pushed down amplifies rounding: a change of the start by 1e-15 m changes the
 activations of a single stepper by up to 0.09 of their bounds."""
 Goals = Callable[[BodyState, StepReport | None, float], Sequence[AnyObjective]]
-"""Function of state, last report and step size that returns the objectives of a step, like that of a motion."""
+"""Function of state, last report and step size that returns the objectives of a step, like ``Motion.objectives``."""
 
 
 @pytest.fixture(scope="module")
 def creature() -> Creature:
-    """The pawn with contact points at its rim only: with 32 points on so coarse a base, the Delassus operator is nearly
-    singular, and rounding decides between contact modes."""
+    """The coarse pawn with contact points only at its rim. With all of its 32 points, the Delassus operator of so
+    coarse a base is nearly singular, and rounding decides between contact modes."""
     pawn = coarse_pawn()
     settings, geometry = LocomotionSettings(qp_solver="admm"), on_its_rim(pawn.geometry)
     return replace(pawn, stepper=LocomotionStepper(pawn.body, pawn.muscles, geometry, settings=settings, device="cpu"))
 
 
 def rising(creature: Creature, speed: float, *, count: int = 4) -> Goals:
-    """Return ``count`` goals: rise at ``speed``, in units of sqrt(g H), with all nodes and without rotation, and unload
-    some nodes."""
+    """Return the first ``count`` of four objectives: the centre of mass rises at ``speed``, in units of sqrt(g H), the
+    body does not rotate, all nodes rise at ``speed``, and some nodes are unloaded."""
     body = creature.body
     up = -speed * body.speed_unit * body.gravity / np.linalg.norm(body.gravity)
     lifted = np.argsort(creature.start.positions @ body.gravity)[-9::3]
@@ -80,8 +80,10 @@ def check_runs(
     dt: float | None = None,
     starts: Sequence[BodyState] | None = None,
 ) -> list[list[list[StepReport]]]:
-    """Assert that all worlds of a batch have the steps of single runs, to 1e-9 in the units of the body; return their
-    reports by world and step. ``goals`` is called for each of the two, because motions have a state."""
+    """Assert that the steps of all worlds of a batch equal those of single runs to 1e-9 in the units of the body.
+
+    Return their reports by world and step. ``goals`` is called for the batch and for the single runs, because motions
+    have a state."""
     dt = solver_steps(creature.body)[0] if dt is None else dt
     starts = starts or [creature.start] * len(goals())
     expected: list[list[list[StepReport]]] = []
@@ -154,7 +156,7 @@ def test_every_step_is_searched_and_planned_again(creature: Creature, monkeypatc
 
 
 def test_failed_searches_are_repeated_on_the_host(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the kernel fails numerically, the plan is that of the host."""
+    """If the kernel fails numerically, the host computes the plan."""
     goals = [rising(creature, 0.3), rising(creature, 0.1)]
     asked, dt = [each(creature.start, None, 0.0) for each in goals], solver_steps(creature.body)[0]
     run, ends = batch_search.SearchPool.run, []
@@ -198,7 +200,7 @@ def test_planning_needs_a_planner_with_the_strategy_modes(creature: Creature) ->
 
 @pytest.mark.slow
 def test_unconverged_steps_are_halved_as_in_single_runs(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two bodies hit the ground in a step that is too long for so few Newton steps; one body stands."""
+    """Two bodies hit the ground in a step that needs more Newton steps than are allowed; one body stands."""
     for module in (batch_step, coupled_step):
         monkeypatch.setattr(module, "MAX_NEWTON_STEPS", 15)
     body, down = creature.body, creature.body.gravity / np.linalg.norm(creature.body.gravity)
@@ -214,7 +216,7 @@ def test_unconverged_steps_are_halved_as_in_single_runs(creature: Creature, monk
 
 @pytest.mark.slow
 def test_jumps_over_different_distances_equal_single_runs(creature: Creature) -> None:
-    """30 steps in a closed loop, in which the motions measure the state of their world."""
+    """The motions compute the objectives of 30 steps from the states of their worlds, in a closed loop."""
 
     def jumps() -> list[Goals]:
         place = initial_stance(creature)

@@ -11,9 +11,9 @@ from tests.support.reference_world import ReferenceWorld
 
 DT = 1 / 120
 TOLERANCE = 1e-6
-"""Maximum difference of the positions, in heights of the prop. Both solvers stop at a small violation of Coulomb's law;
-that of the reference, at most 1e-5 m/s, is 3e-7 heights in a step. Friction that is 1 % too large moves the bodies by
-6e-5 heights.
+"""Maximum difference of the positions, in heights of the prop. Both solvers stop at a small violation of Coulomb's law.
+The reference stops at 1e-5 m/s, which moves a point by 3e-7 heights in a step. With friction that is 1 % too large, the
+positions differ by 6e-5 heights.
 """
 
 

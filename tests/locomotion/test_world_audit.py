@@ -1,5 +1,5 @@
-"""The audit of a world: every error is near zero in a collision and in a slide, and is measured after a deliberate
-change of the trajectories."""
+"""The audit of a world: all errors are near zero in a collision and in a slide, and deliberate errors of the
+trajectories are measured."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Recorded:
         return replace(self, trajectories=tuple(changed))
 
     def with_force(self, contact: int, force: np.ndarray) -> Recorded:
-        """Return the run with another force in one contact of body 0, and the opposite force in body 1."""
+        """Return the run with another ``force`` in one contact of body 0 and the opposite force in that of body 1."""
         t, u = self.trajectories
         other = np.flatnonzero((u.contact_normal == -t.contact_normal[contact]).all(axis=1))
         steps = u.contact_step[other] == t.contact_step[contact]
@@ -64,7 +64,8 @@ class Recorded:
 
 
 def record(world: RunningWorld, steps: int, *, halved: Sequence[int] = ()) -> Recorded:
-    """Run a world and record it; a step before the others is made as half steps by the bodies ``halved`` alone."""
+    """Run a world and record it. If ``halved`` is given, there is an additional first step, which only the bodies
+    ``halved`` make as half steps."""
     bodies = world.stepper.bodies
     recorders = [
         Recorder(each.stepper.body, each.stepper.muscles, each.stepper.geometry, state, 0.0, drag=0.0)
@@ -98,7 +99,7 @@ def collision(*, halved: Sequence[int] = ()) -> Recorded:
 
 @cache
 def slide() -> Recorded:
-    """A prop slides down another, whose friction with the ground is larger."""
+    """A prop slides down another prop, whose coefficient of friction with the ground is larger."""
     slope = np.arctan(0.55)
     up = np.array([-np.sin(slope), 0.0, np.cos(slope)])
     bodies = [box_body((1.6, 0.8, 0.2), up=up, friction=0.9), box_body((0.2, 0.2, 0.1), up=up, friction=0.1)]
@@ -122,7 +123,7 @@ def test_a_correct_run_passes(run: Any) -> None:
     deepest = -min(float(t.min_gap[1:].min()) for t in recorded.trajectories)
     height = min(t.height for t in recorded.trajectories)
     assert pair.penetration * height <= deepest + 1e-9
-    # The work of the pair's contacts is that of the energy balances of both bodies.
+    # The work of the contacts equals the contact terms in the energy balances of both bodies.
     if run is collision:
         books = [energy_balance(t) for t in recorded.trajectories]
         flows = [sum(float((b.friction + b.contact + b.push_out).sum()) for b in books)]
@@ -176,7 +177,7 @@ def test_a_missing_record_is_detected() -> None:
 
 
 def test_friction_not_opposite_to_the_relative_slip_is_detected() -> None:
-    """Friction of one contact is reversed or halved in both records, so action still equals reaction."""
+    """The friction of one contact is reversed or halved in both records, so action still equals reaction."""
     recorded = slide()
     t = recorded.trajectories[0]
     touching = np.flatnonzero(t.contact_plane < 0)
@@ -215,7 +216,7 @@ def test_wrong_gaps_and_normals_are_detected() -> None:
 
 
 def test_lost_momenta_are_detected() -> None:
-    """The errors are the velocity of a single node in the last state, and a body that turns without a torque."""
+    """The errors are the velocity of one node, a rotation of one body without a torque, and ground forces."""
     recorded = collision()
     masses = [t.node_mass.sum() for t in recorded.trajectories]
     u = recorded.trajectories[1]

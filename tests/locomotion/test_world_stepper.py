@@ -1,4 +1,4 @@
-"""Several bodies in one world, against closed forms of collision, rest and sliding, and against one body alone."""
+"""Several bodies in one world, compared with closed forms of collision, rest and sliding, and with one body alone."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_a_collision_in_flight_conserves_momenta_and_does_not_rebound(soft: bool
         linear, angular = linear + DT * mass * gravity, angular + DT * np.cross(weighted, gravity)
         world.advance(DT)
         touched |= any((report.forces[:, 0] > 0.0).any() for reports in world.reports for report in reports)
-        # The arms of the weight are those at the start of a step; implicit Euler moves along the final velocity.
+        # Each step applies the torque of gravity with the positions at its start, as ``angular`` does.
         now = world.momenta()
         assert np.abs(now[0] - linear).max() < 1e-12 * mass
         assert np.abs(now[1] - angular).max() < 1e-12 * mass

@@ -17,7 +17,7 @@ from tests.support.stances import block_place
 
 
 def airborne(place: Stance, turn: Rotation) -> tuple[BodyState, BalanceController, BodyPart]:
-    """Return the state of the standing body after its base alone was rotated, its controller and its base."""
+    """Return the state of a standing body whose base alone was rotated, its controller and its base."""
     controller = BalanceController(place.body, place.ground, place.standing, place.contact_points, place.friction)
     (base,) = AirborneSoles.of(place, place.feet(), on_legs=False).parts
     positions = place.standing.copy()
@@ -28,8 +28,8 @@ def airborne(place: Stance, turn: Rotation) -> tuple[BodyState, BalanceControlle
 
 @pytest.mark.parametrize(("tilt", "yaw"), [(0.3, 0.0), (-0.2, 0.0), (0.0, 0.4)])
 def test_a_base_is_turned_flat_but_not_about_the_up_axis(tilt: float, yaw: float) -> None:
-    """The target rate is the sine of the tilt times the rate of approach, against the tilt; the body turns about the up
-    axis as a whole."""
+    """The target rate is the sine of the tilt times the rate of approach, against the tilt. The whole body is also
+    turned about the up axis."""
     place, rate = block_place(), 3.0
     turn = Rotation.from_rotvec([0.0, 0.0, yaw]) * Rotation.from_rotvec(tilt * place.ground.axes[1])
     state, controller, base = airborne(place, turn)

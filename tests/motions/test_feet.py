@@ -101,8 +101,8 @@ def test_slip_is_the_path_of_loaded_contacts_without_swings() -> None:
 
 
 def test_a_foot_may_turn_about_its_centre_of_pressure_but_not_slide() -> None:
-    """The objective of a foot is the sliding velocity at its centre of pressure. Its weight is proportional to the load
-    of a foot that carries less than a tenth of the weight; a foot without load has none."""
+    """The objective of a foot is zero sliding velocity at its centre of pressure. Its weight is proportional to the
+    load below a tenth of the body weight; a foot without load has no objective."""
     body = make_body(STOOL, Plane(np.array([0.0, 0.0, 1.0]), 0.0))
     soles = [foot.sole for foot in FEET]
     nodes = np.concatenate(soles[:2])

@@ -1,4 +1,4 @@
-"""Motions towards other bodies: their targets are those of the other body at the time at which they start."""
+"""Motions towards other bodies: a target is the position of the other body at the time at which the motion starts."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def sagging(creature: Creature) -> Creature:
 
 
 def on_its_rim(geometry: ContactGeometry, count: int = 12) -> ContactGeometry:
-    """Return the geometry with only ``count`` contact points of the base, the outermost in all directions."""
+    """Return the geometry with only the outermost contact points of the base in ``count`` directions."""
     corners = geometry.mesh.nodes[geometry.mesh.tets[geometry.tet_from_point]]
     places = np.einsum("pw,pwi->pi", geometry.weights, corners)
     heights = geometry.ground_heights(places)

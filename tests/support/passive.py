@@ -52,7 +52,7 @@ class PassiveBody:
             response: ContactLinearization = ContactLinearization.of(tangent, contacts)
             muscles: Any = tension
         else:
-            # Elements on the GPU, matrices on the host: the step of an island of one body.
+            # An island of one body has its elements on the GPU and its matrices on the host.
             island = IslandProblem((problem,)).tangent([self.factors], problem.rigid_guess, [tension])
             response, muscles = IslandLinearizer()(island, contacts), [tension]
         result = solver.solve(response, muscles, velocities=problem.rigid_guess, forces=start)

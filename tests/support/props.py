@@ -29,8 +29,8 @@ def no_muscles(node_count: int) -> MuscleSet:
 
 
 def surface_grid(size: tuple[float, float, float], count: int = 4) -> np.ndarray:
-    """Return the points (n, 3) m of a grid with ``count`` points along each edge that are on the surface of a box on
-    z = 0."""
+    """Return points (n, 3) m on the surface of a box that stands on z = 0: those of a grid with ``count`` points along
+    each edge."""
     axes = [np.linspace(-size[0] / 2, size[0] / 2, count), np.linspace(-size[1] / 2, size[1] / 2, count)]
     axes.append(np.linspace(0.0, size[2], count))
     indices = np.moveaxis(np.indices((count,) * 3), 0, -1).reshape(-1, 3)
@@ -61,7 +61,7 @@ def box_body(
 
 
 class RunningWorld:
-    """A world without objectives, its states and the reports of its last step."""
+    """A world whose bodies have no objectives, with its states and the reports of its last step."""
 
     def __init__(
         self,

@@ -112,7 +112,7 @@ LENSES = {
     "RAD_TAN_THIN_PRISM_FISHEYE": "30 30 12 8 0.1 0 0 0 0 0 0.01 0 0 0.01 0 0",
     "FULL_OPENCV": "30 30 12 8 0.1 0 0.01 0 0 0.2 0 0",
 }
-"""COLMAP's camera models with lenses, and their parameters; no photo uses the first one."""
+"""Parameters of cameras by COLMAP camera model; no photo uses the first one."""
 REALITY_SCAN = (
     b"#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
     b"a.png,1.5,-2,0.25,30,85,-1,35,0.001,-0.002,0.1,0,0,0,0.01,0\n"
@@ -190,7 +190,7 @@ def gltf_of(data: bytes) -> bytes:
 
 
 def packed_glb() -> bytes:
-    """Return a .glb that contains a .spz, shown by two nodes; the second one is mirrored and has two instances."""
+    """Return a .glb with an embedded .spz in two nodes; the second node is mirrored and has two instances."""
     data = glb()
     size = int.from_bytes(data[12:16], "little")
     tree = json.loads(data[20 : 20 + size])

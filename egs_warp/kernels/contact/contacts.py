@@ -1,8 +1,8 @@
 """Kernels for the contacts of all worlds: their record, and the products W^T, W v and W^T f with the contact Jacobian W
 (Eq. 8).
 
-A contact with the ground has one side, a tetrahedron with four nodes. A contact between two bodies has two sides, and
-the weights of the second one are negative. Arrays of K contacts with S sides have K S entries of nodes and weights.
+A contact with the ground has one side, the tetrahedron of its point. A contact between two bodies has two sides; the
+weights of the second side are negative. Arrays of nodes and weights of K contacts with S sides have K S entries.
 """
 
 import warp as wp

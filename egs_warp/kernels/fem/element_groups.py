@@ -1,4 +1,4 @@
-"""Tetrahedra in groups of four for the SIMD kernels of ``elasticity_cpu``: arrays, and C++ functions of one group.
+"""Tetrahedra in groups of four for the SIMD kernels of ``elasticity_cpu``: structs, and C++ functions for a group.
 
 The host code is in ``egs_warp.fem.simd_elasticity``.
 """
@@ -67,7 +67,7 @@ ELEMENTS = """
                 S.at[i][j] = S.at[j][i] = 2.0 * elements.mu * rate[k] + (i == j ? trace_term : v4(0.0));
     };
 """
-"""C++ functions of a group: its deformation gradients, their cofactors, and the damping stress."""
+"""C++ functions for a group of tetrahedra: deformation gradients, cofactors and damping stress."""
 
 
 @wp.struct

@@ -461,7 +461,7 @@ def mode_search_of_worlds_kernel(
     answers: wp.array2d[real],
     settled_out: wp.array2d[int],
 ):
-    """Run the search of ``mode_search_kernel`` in each world, with one block for each.
+    """Run the search of ``mode_search_kernel`` in B worlds, each in a block of its own.
 
     Launch with (B, threads of a block) threads.
 
@@ -469,7 +469,7 @@ def mode_search_of_worlds_kernel(
         packed: (B, ...) packed input of each world.
         workspaces, rows, states, splittings: (B,) scratch memory of each world.
         answers: (B, ...) result of each world.
-        settled_out: (B, 1) not used.
+        settled_out: (B, 1) never set, because no restart runs in parallel with the search.
     """
     world, _ = wp.tid()
     search(

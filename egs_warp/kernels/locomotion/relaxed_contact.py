@@ -298,7 +298,7 @@ def relaxed_qp_of_worlds_kernel(
     # Out:
     answers: wp.array2d[real],
 ):
-    """Run the solve of ``relaxed_qp_kernel`` in each world, with one block for each.
+    """Run the solve of ``relaxed_qp_kernel`` in B worlds, each in a block of its own.
 
     Launch with (B, threads of a block) threads.
 

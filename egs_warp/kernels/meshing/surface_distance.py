@@ -38,7 +38,7 @@ def unsigned_distance_kernel(
     # Out:
     distances_out: wp.array[float],
 ):
-    """Compute the distance of each point from ``mesh``, ``max_distance`` where no triangle is nearer than that."""
+    """Compute the distance of each point from ``mesh``, at most ``max_distance``."""
     i = first_row + wp.tid()
     query = wp.mesh_query_point_no_sign(mesh, points[i], max_distance)
     distance = max_distance
