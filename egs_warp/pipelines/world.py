@@ -95,8 +95,8 @@ class World:
             The placed body, its key in the arguments of ``simulate`` and in the result.
 
         Raises:
-            UserError: The name or the position is invalid, the name is taken, the ground of the body is not a level
-                plane, or the body overlaps a solid or another body.
+            UserError: The name or the position is invalid, the name is taken, the body is on a GPU, the ground of the
+                body is not a level plane, or the body overlaps a solid or another body.
         """
         kind = "prop" if isinstance(body, Prop) else "creature"
         name = f"{kind}-{len(self._members) + 1}" if name is None else name
@@ -106,6 +106,11 @@ class World:
         if not np.abs(numbers).max() <= _MAX_POSITION or above < 0.0:
             given = f"at {at[0]:g}, {at[1]:g}, above {above:g}, heading {heading or 0.0:g}"
             raise UserError(f"{name}: {given}: give finite numbers up to {_MAX_POSITION:g}, and above of at least 0")
+        device = body.body.assembly.device
+        if not device.is_cpu:
+            raise UserError(
+                f"{name}: it is on {device.alias}; worlds are simulated on a CPU, so load its capture there"
+            )
         geometry, gravity = body.geometry, body.body.gravity
         if geometry.field is not None or len(geometry.planes) > 1 or np.abs(gravity[:2]).max() > 0.0:
             raise UserError(f"{name}: its ground is not a level plane; make it without ground, gravity_up and solids")
