@@ -78,9 +78,7 @@ def test_labels_are_numbers_of_objects_and_the_active_one_has_precedence():
     assert state.with_new(last.pick).active == 2
 
 
-def around(
-    point: tuple[float, float, float], *, count: int = 9, span: float = 360.0, fov: float = 30.0
-) -> list[Camera]:
+def around(point: tuple[float, float, float], *, count: int = 9, span: float = 360.0) -> list[Camera]:
     """Return ``count`` cameras that look at a point from an arc of ``span`` degrees in front of it and above it."""
     angles = np.radians(-90.0 + span * (np.arange(count) / count - 0.5))
     eyes = [np.array(point) + 3.0 * np.array([np.cos(angle), np.sin(angle), 0.5]) for angle in angles]
