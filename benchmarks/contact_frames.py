@@ -21,7 +21,7 @@ from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart
 from egs_warp.locomotion.stepper_parts import make_step_linearizer
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.meshing.cage import build_cage
-from egs_warp.motions.stance import Weights
+from egs_warp.motions.balance import Weights
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
 from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.segmentation.base_plane import find_base_plane

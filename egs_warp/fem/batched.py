@@ -7,7 +7,7 @@ PyTorch is not imported here, so that it is not required for one world on a CPU.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
@@ -30,16 +30,27 @@ ArrayT = TypeVar("ArrayT", "np.ndarray", "torch.Tensor")
 class BatchedRecord:
     """Record of c worlds: each of its arrays, also in nested records, has one row per world."""
 
-    def gather(self, worlds: torch.Tensor) -> Self:
+    def gather(self, worlds: Array) -> Self:
         """Return a record of the given ``worlds`` (k,), in their order."""
         return replace(self, **{name: _rows(value, worlds) for name, value in self.batched_fields()})
 
-    def subset(self, worlds: torch.Tensor) -> Self:
+    def with_world_axis(self) -> Self:
+        """Return this record of one world without a world axis as a record with an axis of one world."""
+        return replace(self, **{name: _with_world_axis(value) for name, value in self.batched_fields()})
+
+    @classmethod
+    def concatenated(cls, records: Sequence[Self]) -> Self:
+        """Return the record of the worlds of all ``records``. Fields that are not arrays are those of the first."""
+        names = [name for name, _ in records[0].batched_fields()]
+        columns = {name: _concatenated([getattr(record, name) for record in records]) for name in names}
+        return replace(records[0], **columns)
+
+    def subset(self, worlds: Array) -> Self:
         """Return a record of the ascending ``worlds`` (k,); if these are all worlds, this record itself, uncopied."""
         _, first = next(iter(self.batched_fields()))
         return self if len(worlds) == _count(first) else self.gather(worlds)
 
-    def scatter(self, worlds: torch.Tensor, values: Self) -> None:
+    def scatter(self, worlds: Array, values: Self) -> None:
         """Write the rows of ``values`` to the ``worlds`` (k,) of this record, in place."""
         for name, value in self.batched_fields():
             rows = getattr(values, name)
@@ -63,12 +74,23 @@ class BatchedRecord:
         return [(name, value) for name, value in values if isinstance(value, BatchedRecord) or hasattr(value, "ndim")]
 
 
-def _rows(value: BatchedRecord | torch.Tensor, worlds: torch.Tensor) -> BatchedRecord | torch.Tensor:
+def _rows(value: Any, worlds: Array) -> Any:
     return value.gather(worlds) if isinstance(value, BatchedRecord) else value[worlds]
 
 
 def _rows_on_host(value: torch.Tensor) -> list[Any]:
     return value.tolist() if value.ndim == 1 else list(value.cpu().numpy())
+
+
+def _with_world_axis(value: Any) -> Any:
+    return value.with_world_axis() if isinstance(value, BatchedRecord) else value[None]
+
+
+def _concatenated(values: Sequence[Any]) -> Any:
+    first = values[0]
+    if isinstance(first, BatchedRecord):
+        return type(first).concatenated(values)
+    return array_module(first).concatenate(values)
 
 
 def _count(value: BatchedRecord | torch.Tensor) -> int:

@@ -63,9 +63,21 @@ def kabsch_rotation(masses: np.ndarray, before: np.ndarray, after: np.ndarray) -
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) nearest to ``matrix`` (3, 3)."""
+    """Return the rotations (..., 3, 3) nearest to the ``matrix`` (..., 3, 3)."""
     u, _, vt = np.linalg.svd(matrix)
-    return u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))] @ vt
+    signs = np.ones(matrix.shape[:-1])
+    signs[..., 2] = np.sign(np.linalg.det(u @ vt))
+    return u * signs[..., None, :] @ vt
+
+
+def times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return the products (..., i) of ``matrices`` (..., i, j) and ``vectors`` (..., j)."""
+    return (matrices @ vectors[..., None])[..., 0]
+
+
+def dots(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the dot products (...,) of vectors (..., k)."""
+    return (one * other).sum(axis=-1)
 
 
 def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -141,18 +141,47 @@ def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.nda
         target: (N, 3) m/s, nodal velocities that lead to a pose.
         weight: weight.
     """
-    arms = positions - body.centre_of_mass(positions)
-    modes = np.zeros((12, len(arms), 3))
-    modes[:3], modes[3:6] = np.eye(3)[:, None], np.moveaxis(cross_matrices(arms), 2, 0)
-    for mode, (i, k) in enumerate(combinations_with_replacement(range(3), 2), start=6):
-        modes[mode, :, k] += arms[:, i]
-        modes[mode, :, i] += arms[:, k]
-    weights = body.mass_roots
-    # Transposed, because the QR factorisation orthonormalises columns.
-    orthonormal, triangle = np.linalg.qr((modes.reshape(12, -1) * weights).T)
-    independent = 6 + np.flatnonzero(np.abs(np.diag(triangle)[6:]) > 1e-6 * np.abs(triangle).max())
-    rows = (orthonormal[:, independent] * weights[:, None]).T
+    arms, shares = positions - body.centre_of_mass(positions), body.node_mass / body.mass
+    modes, is_independent = strain_modes(np.einsum("n,ni,nj->ij", shares, arms, arms))
+    rows = np.einsum("n,rij,nj->rni", shares, modes[is_independent], arms).reshape(is_independent.sum(), -1)
     return Objective("pose", rows, rows @ target.ravel(), weight)
+
+
+def strain_modes(second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rates of stretch and shear of a body as affine velocity fields A_r arm, orthonormal in the
+    mass-weighted mean and orthogonal to rotations. "..." is the world axis, or nothing for one world.
+
+    Args:
+        second: (..., 3, 3) m^2, mass-weighted mean of the products of the arms of the nodes.
+
+    Returns:
+        The matrices A_r (..., 6, 3, 3) 1/m, and (..., 6) bool, True for independent modes; a flat body has fewer.
+    """
+    moments, axes = np.linalg.eigh(second)
+    roots = np.sqrt(np.maximum(moments, 0.0))[..., None, :]
+    floor = _MIN_MODE * roots.max(axis=-1, keepdims=True)
+    inverse = np.where(roots > floor, 1.0 / np.maximum(roots, floor), 0.0)
+    # In the coordinates A half, with half half^T = second, the mean of (A arm) (B arm) is the sum of A_ij B_ij.
+    coordinates = (_LINEAR_MODES @ (axes * roots)[..., None, :, :]).reshape(*second.shape[:-2], 9, 9)
+    orthonormal, triangle = np.linalg.qr(coordinates.swapaxes(-1, -2))
+    sizes = np.abs(np.diagonal(triangle, axis1=-2, axis2=-1))
+    modes = orthonormal[..., 3:].swapaxes(-1, -2).reshape(*second.shape[:-2], 6, 3, 3)
+    back = (axes * inverse).swapaxes(-1, -2)
+    return modes @ back[..., None, :, :], sizes[..., 3:] > _MIN_MODE * sizes.max(axis=-1, keepdims=True)
+
+
+def _linear_modes() -> np.ndarray:
+    """Return (9, 3, 3), the matrices of three rotations and of the symmetric unit strains."""
+    modes = np.zeros((9, 3, 3))
+    modes[:3] = np.cross(np.eye(3)[:, None], np.eye(3)).swapaxes(1, 2)
+    for mode, (i, k) in enumerate(combinations_with_replacement(range(3), 2), start=3):
+        modes[mode, k, i] += 1.0
+        modes[mode, i, k] += 1.0
+    return modes
+
+
+_LINEAR_MODES, _MIN_MODE = _linear_modes(), 1e-6
+"""Rotations and strains; minimum ratio of an independent strain mode to the largest one."""
 
 
 @dataclass(frozen=True)

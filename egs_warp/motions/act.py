@@ -278,7 +278,7 @@ class Act:
         if isinstance(self.below, Walk):
             self.below.with_gestures = partial(self._with_gestures, active, elapsed + dt)
         elif isinstance(self.below, Jump):
-            self.below.controller.gesture_turn = turn
+            self.below.gesture_turn = turn
         if self.below is not None and not self.below.is_at_rest:
             rules = list(self.below.objectives(state, report, dt))
         else:

@@ -1,4 +1,4 @@
-"""Objectives of the soles of a body in the air: move to their places in the landing pose, and turn a base flat."""
+"""Objectives of the soles of bodies in the air: move to their places in the landing pose, and turn a base flat."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from egs_warp.fem.body import BodyState
-from egs_warp.geometry.frames import kabsch_rotation
-from egs_warp.locomotion.objectives import AnyObjective, BodyPart, Coordinates, part_angular_velocity, part_velocity
+from egs_warp.fem.batched import BatchedRecord
+from egs_warp.geometry.frames import nearest_rotation, times
+from egs_warp.locomotion.objectives import BodyPart
+from egs_warp.locomotion.reduced_objectives import AffineObjectives
+from egs_warp.motions.balance import Balance
 from egs_warp.motions.feet import Foot
+from egs_warp.motions.moments import PartMoments
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.stance import BalanceController, sole_shares
+from egs_warp.motions.stance import sole_shares
 
 SWING_WEIGHT, BASE_SWING_WEIGHT = 5.0, 1.0
 """Weights of the velocities of the soles in the air, for feet on legs and for a single base. Without these objectives,
@@ -23,58 +26,81 @@ BASE_TILT_WEIGHT = 5.0
 Without this objective, the base of a lamp lands on its rear rim, tilted by 35 degrees."""
 _MIN_INERTIA_RATIO = 1e-6
 """Minimum ratio of the smallest to the largest principal moment of inertia of a sole that spans an area."""
+_BASE = 1
+"""Index of the base among the parts of ``BalanceController.shares``; the soles of the feet follow."""
 
 
 @dataclass(frozen=True)
-class AirborneSoles:
-    """Soles of a body in the air and the weights of their objectives. There is one sole for each foot on a leg, or the
-    base alone."""
+class AirborneSoles(BatchedRecord):
+    """Soles of bodies in the air and the weights of their objectives. There is one sole for each foot on a leg, or the
+    base alone. "..." is the world axis, or nothing for one world."""
 
-    parts: tuple[BodyPart, ...]
-    swing_weight: float
-    """Weight of the velocity of a sole."""
-    tilt_weight: float
-    """Weight of the tilt rate of a sole; 0 for feet on legs, which are too short to need it."""
+    swing_weight: np.ndarray
+    """(..., S) weights of the velocities of the base and of the soles of the feet."""
+    tilt_weight: np.ndarray
+    """(...,) weight of the tilt rate of the base; 0 for feet on legs, which are too short to need it."""
 
     @classmethod
     def of(cls, stance: Stance, feet: Sequence[Foot], *, on_legs: bool) -> AirborneSoles:
         """Return the soles of the body of ``stance``: those of its ``feet`` if they are ``on_legs``, else its base."""
-        body = stance.body
         if on_legs:
-            return cls(tuple(BodyPart.of(body, "sole", foot.sole) for foot in feet), SWING_WEIGHT, 0.0)
+            return cls(np.array([0.0, *(SWING_WEIGHT for _ in feet)]), np.asarray(0.0))
+        body = stance.body
         base = BodyPart.of(body, "sole", np.flatnonzero(sole_shares(body, stance.ground, stance.standing)))
         moments = np.linalg.eigvalsh(base.inertia(stance.standing))
         spans_area = moments[0] > _MIN_INERTIA_RATIO * moments[-1]
-        return cls((base,), BASE_SWING_WEIGHT, BASE_TILT_WEIGHT if spans_area else 0.0)
+        return cls(np.array([BASE_SWING_WEIGHT]), np.asarray(BASE_TILT_WEIGHT if spans_area else 0.0))
 
     def objectives(
-        self, controller: BalanceController, state: BodyState, pose: np.ndarray, rate: float, share: float
-    ) -> list[AnyObjective]:
+        self, balance: Balance, moments: PartMoments, pose: np.ndarray, rate: np.ndarray, share: np.ndarray
+    ) -> AffineObjectives:
         """Return the objectives that move the soles to their positions in the pose of the landing and tilt them to
         their orientations there.
 
         Args:
-            controller: balance controller of the standing body.
-            state: current state.
-            pose: (3, 3) rotation of the standing body to its landing pose.
-            rate: 1/s, rate at which the pose is approached.
-            share: factor of the weights.
+            balance: balance of the standing body.
+            moments: moments of its parts.
+            pose: (..., 3, 3) target pose, world axes.
+            rate: (...,) 1/s, rate at which the pose is approached.
+            share: (...,) factor of the weights.
         """
-        body, arms, level = controller.body, controller.arms, Coordinates(controller.ground.axes[:2], False)
-        com, about = body.centre_of_mass(state.positions), Coordinates(np.eye(3), True)
-        objectives: list[AnyObjective] = []
-        for sole in self.parts:
-            offset = pose @ sole.centre(arms) - (sole.centre(state.positions) - com)
-            objectives.append(part_velocity(body, sole, rate * offset, share * self.swing_weight, about))
-            if self.tilt_weight > 0.0:
-                now, target = (_normal(controller, sole, points) for points in (state.positions, arms @ pose.T))
-                spin = rate * level.axes @ np.cross(now, target)
-                objectives.append(part_angular_velocity(body, sole, state, spin, share * self.tilt_weight, level))
-        return objectives
+        worlds, parts = share.shape, moments.centres.shape[-2]
+        blocks = []
+        for sole in range(self.swing_weight.shape[-1]):
+            part = _BASE + sole
+            standing, now = (
+                each.centres[..., part, :] - each.centres[..., 0, :] for each in (balance.standing, moments)
+            )
+            coefficients = np.zeros((*worlds, 3, parts, 3, 4))
+            coefficients[..., part, :, 3], coefficients[..., 0, :, 3] = np.eye(3), -np.eye(3)
+            targets = rate[..., None] * (times(pose, standing) - now)
+            weights = np.repeat((share * self.swing_weight[..., sole])[..., None], 3, axis=-1)
+            blocks.append(AffineObjectives(("sole velocity",) * 3, coefficients, targets, weights))
+        if self.tilt_weight.any():
+            blocks.append(self._tilt_objectives(balance, moments, pose, rate, share))
+        return AffineObjectives.joined(blocks)
 
-
-def _normal(controller: BalanceController, sole: BodyPart, points: np.ndarray) -> np.ndarray:
-    """Return the unit normal (3,) of a ``sole`` of a body with nodes at ``points`` (N, 3): the up axis, rotated by the
-    best-fit rotation of the sole from its standing shape."""
-    before, after = (x[sole.nodes] - sole.centre(x) for x in (controller.arms, points))
-    return kabsch_rotation(sole.masses, before, after) @ controller.ground.axes[2]
+    def _tilt_objectives(
+        self, balance: Balance, moments: PartMoments, pose: np.ndarray, rate: np.ndarray, share: np.ndarray
+    ) -> AffineObjectives:
+        """Return the two objectives on the tilt rates of the base; the arguments are those of ``objectives``. They
+        concern the angular velocity of a rigid body with the angular momentum of the base, times its radius of
+        gyration."""
+        up, level = balance.axes[..., 2, :], balance.axes[..., :2, :]
+        second = moments.second[..., _BASE, :, :]
+        now = times(nearest_rotation(moments.cross[..., _BASE, :, :] @ balance.axes), up)
+        target = times(nearest_rotation(pose @ balance.standing.second[..., _BASE, :, :]), up)
+        spin = times(level, np.cross(now, target)) * rate[..., None]
+        trace = np.trace(second, axis1=-2, axis2=-1)
+        radius = np.sqrt(trace)[..., None]
+        # A flat base has no inverse inertia about some axis; its weight is zero.
+        has_tilt = (self.tilt_weight > 0.0)[..., None, None]
+        inertia = np.where(has_tilt, trace[..., None, None] * np.eye(3) - second, np.eye(3))
+        turning = radius[..., None] * (level @ np.linalg.inv(inertia))
+        matrices = np.cross(turning[..., None, :], np.eye(3)).swapaxes(-1, -2)
+        offset = moments.centres[..., _BASE, :] - moments.centres[..., 0, :]
+        coefficients = np.zeros((*share.shape, 2, moments.centres.shape[-2], 3, 4))
+        coefficients[..., _BASE, :, :3] = matrices
+        coefficients[..., _BASE, :, 3] = -times(matrices, offset[..., None, :])
+        weights = np.repeat((share * self.tilt_weight)[..., None], 2, axis=-1)
+        return AffineObjectives(("sole turning",) * 2, coefficients, radius * spin, weights)

@@ -19,7 +19,6 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import heading_between, sole_shares
 from egs_warp.motions.stand import Stand
 from egs_warp.motions.turn import MAX_TURN_FRACTION, largest_turn
-from egs_warp.motions.twist import TurnHeading
 
 MIN_HEIGHT, MAX_HEIGHT = 0.1, 0.6
 """Minimum and maximum height of the jumps of a dance, in body heights."""
@@ -291,9 +290,7 @@ class Dance:
         if not landing.twists:
             return straight
         max_turn = MAX_TURN_FRACTION * largest_turn(straight, stance)
-        return Jump(
-            stance, target, skips_settling=True, facing=TurnHeading(stance, float(np.clip(turn, -max_turn, max_turn)))
-        )
+        return Jump(stance, target, skips_settling=True, turn=float(np.clip(turn, -max_turn, max_turn)))
 
     def _aim(self, now: float) -> Span | None:
         """Return take-off and touch-down of the next jump of a body that stands at time ``now``; None without one."""

@@ -29,7 +29,8 @@ from egs_warp.motions.body_parts import find_shape_parts
 from egs_warp.motions.feet import order_counterclockwise
 from egs_warp.motions.keyframes import Channel, Key, Quantity, channels
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.stance import BalanceController, RestDetector, Weights
+from egs_warp.motions.balance import Weights
+from egs_warp.motions.stance import BalanceController, RestDetector
 
 MISS_TOLERANCE = 0.1
 """Maximum error of a key, as a fraction of the largest value of its channel; larger errors are reported."""

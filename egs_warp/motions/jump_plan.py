@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
+from egs_warp.fem.batched import BatchedRecord
 from egs_warp.motions.style import Style
 
 EXIT_SPEED_FACTOR = 2.0
@@ -68,55 +70,63 @@ class JumpTarget:
 
 
 @dataclass(frozen=True)
-class JumpPlan:
-    """Planned quantities of a jump; metres, seconds, m/s."""
+class JumpPlan(BatchedRecord):
+    """Planned quantities of a jump, or (c,) of the jumps of c worlds; metres, seconds, m/s."""
 
-    crouch_depth: float
-    extension: float
-    crouch_time: float
+    crouch_depth: Any
+    extension: Any
+    crouch_time: Any
     """Duration of the crouch, s: a whole number of time steps, so that the objectives are continuous where the thrust
     starts."""
-    thrust_time: float
-    flight_time: float
-    speed_up: float
-    speed_forward: float
-    lean: float
+    thrust_time: Any
+    flight_time: Any
+    speed_up: Any
+    speed_forward: Any
+    lean: Any
     """Forward displacement of the centre of mass during the crouch, m."""
-    landing_lag: float
+    landing_lag: Any
     """Distance of the centre of mass behind its standing position over the feet at touch-down, m."""
-    landing_rate: float
+    landing_rate: Any
     """1/s, natural frequency of the descent on landing."""
-    landing_damping: float
+    landing_damping: Any
     """Damping ratio of the descent on landing; below 1, the body rises above its standing height before it settles."""
 
     @property
     def _down(self) -> np.ndarray:
-        """(3,) m, displacement of the centre of mass during the crouch."""
-        return np.array([self.lean, 0.0, -self.crouch_depth])
+        """(..., 3) m, displacement of the centre of mass during the crouch."""
+        return _vector(self.lean, -self.crouch_depth)
 
     @property
     def _onset(self) -> np.ndarray:
-        """(3,) m/s, velocity at the end of the crouch: zero upward but already forward, because friction limits the
+        """(..., 3) m/s, velocity at the end of the crouch: zero upward but already forward, because friction limits the
         forward acceleration during the thrust."""
-        return np.array([min(EXIT_SPEED_FACTOR * self.lean / self.crouch_time, self.speed_forward), 0.0, 0.0])
+        return _vector(np.minimum(EXIT_SPEED_FACTOR * self.lean / self.crouch_time, self.speed_forward), 0.0)
 
-    def crouch(self, start: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position (3,) and velocity (3,) of the centre of mass ``elapsed`` seconds into the crouch; ``start``
-        (3,) is its standing position."""
-        s = min(elapsed / self.crouch_time, 1.0)
-        blend, slope = s * s * (3 - 2 * s), 6 * s * (1 - s) / self.crouch_time
-        carried, rate = s * s * (s - 1) * self.crouch_time, s * (3 * s - 2)
+    @property
+    def _take_off(self) -> np.ndarray:
+        """(..., 3) m/s, velocity at take-off."""
+        return _vector(self.speed_forward, self.speed_up)
+
+    def crouch(self, start: np.ndarray, elapsed: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+        """Return position (..., 3) and velocity (..., 3) of the centre of mass ``elapsed`` (...,) seconds into the
+        crouch; ``start`` (..., 3) is its standing position."""
+        time = np.asarray(self.crouch_time)[..., None]
+        s = np.minimum(np.asarray(elapsed)[..., None] / time, 1.0)
+        blend, slope = s * s * (3 - 2 * s), 6 * s * (1 - s) / time
+        carried, rate = s * s * (s - 1) * time, s * (3 * s - 2)
         return start + blend * self._down + carried * self._onset, slope * self._down + rate * self._onset
 
-    def thrust(self, start: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position (3,) and velocity (3,) of the centre of mass ``elapsed`` seconds into the thrust.
+    def thrust(self, start: np.ndarray, elapsed: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+        """Return position (..., 3) and velocity (..., 3) of the centre of mass ``elapsed`` (...,) seconds into the
+        thrust.
 
-        The acceleration grows to a constant value, and the thrust ends with the take-off velocity. ``start`` (3,) is
-        the standing position.
+        The acceleration grows to a constant value, and the thrust ends with the take-off velocity. ``start`` (..., 3)
+        is the standing position.
         """
-        gained = np.array([self.speed_forward, 0.0, self.speed_up]) - self._onset
-        speed, displacement = ramp_integrals(elapsed / self.thrust_time)
-        position = start + self._down + self._onset * elapsed + displacement * self.thrust_time * gained
+        time, elapsed = np.asarray(self.thrust_time)[..., None], np.asarray(elapsed)[..., None]
+        gained = self._take_off - self._onset
+        speed, displacement = ramp_integrals(elapsed / time)
+        position = start + self._down + self._onset * elapsed + displacement * time * gained
         return position, self._onset + speed * gained
 
     def expected_duration(self, distance: float, time_unit: float) -> float:
@@ -143,40 +153,43 @@ class JumpPlan:
         elapsed -= self.thrust_time
         if elapsed > self.flight_time:
             return np.full(3, np.nan)
-        speed = np.array([self.speed_forward, 0.0, self.speed_up])
-        return position + elapsed * speed - 0.5 * gravity * elapsed**2 * np.array([0.0, 0.0, 1.0])
+        return position + elapsed * self._take_off - 0.5 * gravity * elapsed**2 * np.array([0.0, 0.0, 1.0])
 
 
-def sufficient_speed(rise: float, gravity: float, dt: float) -> float:
-    """Return the upward speed in m/s at the end of a time step of ``dt`` s with which free flight rises by ``rise``
-    metres above the position at the start of the step."""
+def sufficient_speed(rise: np.ndarray | float, gravity: float, dt: float) -> np.ndarray:
+    """Return the upward speed (...,) in m/s at the end of a time step of ``dt`` s with which free flight rises by
+    ``rise`` (...,) metres above the position at the start of the step."""
     step_gain = gravity * dt  # v dt + (v - g dt/2)^2 / 2g = rise, solved for v
-    return float(max(-0.5 * step_gain + np.sqrt(max(2.0 * gravity * rise, 0.0)), 0.0))
+    return np.maximum(-0.5 * step_gain + np.sqrt(np.maximum(2.0 * gravity * rise, 0.0)), 0.0)
 
 
-def ramp_integrals(share: float) -> tuple[float, float]:
-    """Return the dimensionless speed and displacement of a thrust after the fraction ``share`` of its duration.
+def ramp_integrals(share: np.ndarray | float) -> tuple[Any, Any]:
+    """Return the dimensionless speed and displacement of a thrust after the fraction ``share`` (...,) of its duration.
 
     The unit of speed is the total gain of speed; the unit of displacement is this gain times the duration.
 
     The acceleration grows from ``THRUST_START_FRACTION`` to its full value over the first ``THRUST_RAMP_FRACTION`` of
     the thrust, because muscles cannot be switched on at once.
     """
-    ramp = min(share, THRUST_RAMP_FRACTION)
+    ramp = np.minimum(share, THRUST_RAMP_FRACTION)
     speed = THRUST_START_FRACTION * ramp + (1.0 - THRUST_START_FRACTION) * ramp**2 / (2.0 * THRUST_RAMP_FRACTION)
     displacement = THRUST_START_FRACTION * ramp**2 / 2.0 + (1.0 - THRUST_START_FRACTION) * ramp**3 / (
         6.0 * THRUST_RAMP_FRACTION
     )
     rest = share - ramp
-    displacement += speed * rest + 0.5 * rest**2
-    speed += rest
+    displacement = displacement + speed * rest + 0.5 * rest**2
     whole = 1.0 - 0.5 * (1.0 - THRUST_START_FRACTION) * THRUST_RAMP_FRACTION
-    return speed / whole, displacement / whole
+    return (speed + rest) / whole, displacement / whole
 
 
-def stopping_time(com_height: float, fall_speed: float, gravity: float, landing_time: float = 0.0) -> float:
-    """Return the time t in seconds such that a body that lands with forward speed v comes to rest over its feet if they
-    are v t ahead of its centre of mass at touch-down.
+def stopping_time(
+    com_height: np.ndarray | float,
+    fall_speed: np.ndarray | float,
+    gravity: float,
+    landing_time: np.ndarray | float = 0.0,
+) -> Any:
+    """Return the time t (...,) in seconds such that a body that lands with forward speed v comes to rest over its feet
+    if they are v t ahead of its centre of mass at touch-down.
 
     Let y be the distance of the feet ahead of the centre of mass, h its height above them (``com_height``), s the
     ``fall_speed`` and T the ``landing_time`` in which the fall is stopped. In a landing without spin, the ground force
@@ -184,12 +197,18 @@ def stopping_time(com_height: float, fall_speed: float, gravity: float, landing_
     After T, the capture point must be at the feet: -y' = sqrt(g / h) y. For T = 0, the landing impulse reduces the
     forward speed by s y / h at once.
     """
-    swaying = np.sqrt(gravity / com_height)
-    if landing_time <= 0.0:
-        return float(1.0 / (swaying + fall_speed / com_height))
-    loaded_rate = np.sqrt((gravity + fall_speed / landing_time) / com_height)
-    even, odd = np.cosh(loaded_rate * landing_time), np.sinh(loaded_rate * landing_time)
-    return float((even + swaying / loaded_rate * odd) / (swaying * even + loaded_rate * odd))
+    swaying, is_gradual = np.sqrt(gravity / com_height), np.asarray(landing_time) > 0.0
+    duration = np.where(is_gradual, landing_time, 1.0)
+    loaded_rate = np.sqrt((gravity + fall_speed / duration) / com_height)
+    even, odd = np.cosh(loaded_rate * duration), np.sinh(loaded_rate * duration)
+    gradual = (even + swaying / loaded_rate * odd) / (swaying * even + loaded_rate * odd)
+    return np.where(is_gradual, gradual, 1.0 / (swaying + fall_speed / com_height))
+
+
+def _vector(forward: Any, up: Any) -> np.ndarray:
+    """Return the vectors (..., 3) with these components (...,)."""
+    forward = np.asarray(forward)
+    return np.stack([forward, np.zeros_like(forward), np.broadcast_to(up, forward.shape)], axis=-1)
 
 
 def level_flight(jump_height: float, height: float, gravity: float) -> float:

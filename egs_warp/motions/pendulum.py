@@ -51,20 +51,20 @@ def drift(off: np.ndarray, push: np.ndarray, growth: float) -> np.ndarray:
     return off * growth - push * (growth - 1.0)
 
 
-def momentum_as_velocity(momentum: np.ndarray, mass: float, height: float) -> np.ndarray:
-    """Return the velocity (2,) m/s of the centre of mass along the ground that contributes as much to the angular
+def momentum_as_velocity(momentum: np.ndarray, mass: float, height: np.ndarray | float) -> np.ndarray:
+    """Return the velocity (..., 2) m/s of the centre of mass along the ground that contributes as much to the angular
     momentum about a point on the ground as the angular momentum about the centre of mass does.
 
     Args:
-        momentum: (3,) kg m^2/s, angular momentum about the centre of mass, ground axes.
+        momentum: (..., 3) kg m^2/s, angular momentum about the centre of mass, ground axes.
         mass: mass of the body, kg.
-        height: height of the centre of mass above the point, m.
+        height: (...,) m, height of the centre of mass above the point.
     """
-    turning = momentum / (mass * height)
-    return np.array([turning[1], -turning[0]])
+    turning = momentum / np.asarray(mass * height)[..., None]
+    return np.stack([turning[..., 1], -turning[..., 0]], axis=-1)
 
 
-def capture_point(com: np.ndarray, velocity: np.ndarray, rate: float) -> np.ndarray:
-    """Return the point (2,) over which a pendulum with its centre of mass at ``com`` (2,) m, moving at ``velocity``
-    (2,) m/s, comes to rest; ``rate`` is w, 1/s."""
-    return com + velocity / rate
+def capture_point(com: np.ndarray, velocity: np.ndarray, rate: np.ndarray | float) -> np.ndarray:
+    """Return the point (..., 2) over which a pendulum with its centre of mass at ``com`` (..., 2) m, moving at
+    ``velocity`` (..., 2) m/s, comes to rest; ``rate`` (...,) is w, 1/s."""
+    return com + velocity / np.asarray(rate)[..., None]

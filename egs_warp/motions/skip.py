@@ -15,7 +15,6 @@ from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import heading_between, sole_shares
 from egs_warp.motions.turn import MAX_TURN_FRACTION, largest_turn
-from egs_warp.motions.twist import TurnHeading
 
 _MAX_LENGTH = 0.3
 """Largest length of one jump, in body heights."""
@@ -118,5 +117,4 @@ class Skip:
         target = JumpTarget(float(np.linalg.norm(start.ground.axes[:2] @ offset)), self._height)
         turned = heading_between(start.standing, positions, self._share, start.ground)
         side = 0.0 if number == self._count else self._turn * (-1.0) ** number
-        facing = TurnHeading(stance, side - turned)
-        return Jump(stance.with_forward(offset), target, facing=facing, skips_settling=number > 1)
+        return Jump(stance.with_forward(offset), target, turn=side - turned, skips_settling=number > 1)

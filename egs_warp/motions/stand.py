@@ -12,7 +12,8 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.stance import REST_SPEED, BalanceController, RestDetector, Weights, sole_shares
+from egs_warp.motions.balance import Weights
+from egs_warp.motions.stance import REST_SPEED, BalanceController, RestDetector, sole_shares
 
 _RATE = 4.0
 """Rate in sqrt(g / H) at which the centre of mass returns over the feet."""

@@ -1,124 +1,163 @@
-"""Support polygon: the convex hull of the contact points on the ground, and the margins of points in it."""
+"""Support polygon: the convex hull of the contact points on the ground, and the margins of points in it.
+
+In the shapes below, "..." is the world axis, or nothing for one world.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import ConvexHull
+import warp as wp
 
-_LINE_TOLERANCE = 1e-6
-"""Maximum ratio of width to length of points that are considered collinear."""
-_TOLERANCE = 1e-9
-"""Maximum distance outside a half plane, relative to the distances involved, of a point that is considered inside."""
+from egs_warp.fem.batched import BatchedRecord, launch_on
+from egs_warp.kernels.motions.support import LINE_TOLERANCE, Vec2, hull_kernel, nearest_kernel
+from egs_warp.precision import real
 
 
 @dataclass(frozen=True)
-class SupportPolygon:
-    """Convex polygon on the ground. It may degenerate to a segment or a point."""
+class SupportPolygon(BatchedRecord):
+    """Convex polygon on the ground. It may degenerate to a segment or a point.
+
+    Polygons of many worlds are padded with their last corner and their last edge.
+    """
 
     corners: np.ndarray
-    """(k, 2) m, corners in counterclockwise order."""
+    """(..., k, 2) m, corners in counterclockwise order."""
     normals: np.ndarray
-    """(m, 2) outward unit normals of the edges."""
+    """(..., m, 2) outward unit normals of the edges."""
     offsets: np.ndarray
-    """(m,) m, offsets of the edges: a point is inside if its dot product with each normal is at most the offset."""
+    """(..., m) m, offsets of the edges: a point is inside if its dot product with each normal is at most the offset."""
 
     @classmethod
-    def hull(cls, points: np.ndarray) -> SupportPolygon:
-        """Return the convex hull of ``points`` (n, 2), n > 0. They may be collinear."""
-        if is_line(points):
-            along = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[2][0]
-            coordinates = points @ along
-            ends = points[[coordinates.argmin(), coordinates.argmax()]]
-            normals = np.array([along, -along, [-along[1], along[0]], [along[1], -along[0]]])
-            return cls(ends, normals, (normals @ ends.T).max(axis=1))
-        hull = ConvexHull(points)
-        return cls(points[hull.vertices], hull.equations[:, :2], -hull.equations[:, 2])
+    def hull(cls, points: np.ndarray, counts: np.ndarray | None = None) -> SupportPolygon:
+        """Return the convex hull of ``points`` (..., n, 2), n > 0. They may be collinear.
+
+        Args:
+            points: (..., n, 2) m.
+            counts: (...,) number of points of each world, the first of its row; None for all.
+        """
+        worlds, count = points.shape[:-2], points.shape[-2]
+        by_world = points.reshape(-1, count, 2)
+        size, capacity = len(by_world), max(count + 1, 4)
+        corners, normals = np.empty((size, capacity, 2)), np.empty((size, capacity, 2))
+        offsets, sizes = np.empty((size, capacity)), np.empty((2, size), np.int32)
+        used = np.full(size, count, np.int32) if counts is None else counts.reshape(-1).astype(np.int32)
+        launch_on(
+            points,
+            hull_kernel,
+            size,
+            inputs=[(by_world, Vec2), (used, wp.int32), (np.empty((size, count), np.int32), wp.int32)],
+            outputs=[(corners, Vec2), (normals, Vec2), (offsets, real), (sizes[0], wp.int32), (sizes[1], wp.int32)],
+        )
+        k, m = sizes.max(axis=1)
+        return cls(
+            corners[:, :k].reshape(*worlds, k, 2),
+            normals[:, :m].reshape(*worlds, m, 2),
+            offsets[:, :m].reshape(*worlds, m),
+        )
+
+    @classmethod
+    def concatenated(cls, records: Sequence[SupportPolygon]) -> SupportPolygon:
+        """Return the polygons of the worlds of all ``records``."""
+        columns = zip(*((one.corners, one.normals, one.offsets) for one in records), strict=True)
+        return cls(*(_concatenate_padded(each) for each in columns))
 
     @cached_property
     def middle(self) -> np.ndarray:
-        """(2,) m, centre of area; the mean of the corners of a polygon without area."""
-        first, then = self.corners, np.roll(self.corners, -1, axis=0)
+        """(..., 2) m, centre of area; the middle of a segment."""
         # Use coordinates relative to a corner, so that no digits are lost far from the origin.
-        first, then = first - self.corners[0], then - self.corners[0]
-        areas = first[:, 0] * then[:, 1] - first[:, 1] * then[:, 0]
-        if areas.sum() <= 0.0:
-            return self.corners.mean(axis=0)
-        return self.corners[0] + areas @ (first + then) / (3.0 * areas.sum())
+        start = self.corners[..., :1, :]
+        first = self.corners - start
+        then = np.roll(first, -1, axis=-2)
+        areas = first[..., 0] * then[..., 1] - first[..., 1] * then[..., 0]
+        total = areas.sum(axis=-1)[..., None]
+        moments = (areas[..., None] * (first + then)).sum(axis=-2)
+        is_flat = total <= 0.0
+        centre = moments / np.where(is_flat, 1.0, 3.0 * total)
+        return start[..., 0, :] + np.where(is_flat, 0.5 * first[..., -1, :], centre)
 
     def moved(self, offset: np.ndarray) -> SupportPolygon:
-        """Return the polygon displaced by ``offset`` (2,) m."""
-        return SupportPolygon(self.corners + offset, self.normals, self.offsets + self.normals @ offset)
+        """Return the polygon displaced by ``offset`` (..., 2) m."""
+        return SupportPolygon(
+            self.corners + offset[..., None, :], self.normals, self.offsets + _levels(self.normals, offset)
+        )
 
     def scaled(self, fraction: float) -> SupportPolygon:
         """Return the polygon scaled about its middle."""
-        levels = self.normals @ self.middle
+        middle = self.middle[..., None, :]
+        levels = _levels(self.normals, self.middle)
         return SupportPolygon(
-            self.middle + fraction * (self.corners - self.middle),
+            middle + fraction * (self.corners - middle),
             self.normals,
             levels + fraction * (self.offsets - levels),
         )
 
     def margin(self, point: np.ndarray) -> float:
-        """Return the distance in metres of ``point`` (2,) from the nearest edge: positive inside, negative outside."""
+        """Return the distance in metres of ``point`` (2,) from the nearest edge of the polygon of one world: positive
+        inside, negative outside."""
         inside = float((self.offsets - self.normals @ point).min())
         return inside if inside >= 0.0 else -float(np.linalg.norm(self.nearest(point) - point))
 
-    def relative_distance(self, point: np.ndarray, min_distance: float) -> float:
-        """Return the distance of ``point`` (2,) from the middle, as a fraction of the distance to the edge in the same
-        direction: 0 in the middle, 1 on the edge. The distance to the edge is taken as at least ``min_distance``, m.
-        """
-        levels = self.normals @ self.middle
-        return float(
-            ((self.normals @ point - levels) / np.maximum(self.offsets - levels, min_distance)).max(initial=0.0)
-        )
+    def relative_distance(self, point: np.ndarray, min_distance: float) -> np.ndarray:
+        """Return the distance (...,) of ``point`` (..., 2) from the middle, as a fraction of the distance to the edge
+        in the same direction: 0 in the middle, 1 on the edge. The distance to the edge is taken as at least
+        ``min_distance``, m."""
+        levels = _levels(self.normals, self.middle)
+        beyond = _levels(self.normals, point) - levels
+        return (beyond / np.maximum(self.offsets - levels, min_distance)).max(axis=-1, initial=0.0)
 
-    def extent(self, direction: np.ndarray) -> float:
-        """Return the distance in metres from the origin to the farthest point along the unit vector ``direction``
-        (2,): the support function of the polygon."""
-        return float((self.corners @ direction).max())
+    def extent(self, direction: np.ndarray) -> np.ndarray:
+        """Return the distance (...,) in metres from the origin to the farthest point along the unit vector
+        ``direction`` (2,): the support function of the polygon."""
+        return (self.corners @ direction).max(axis=-1)
 
     def nearest(self, point: np.ndarray) -> np.ndarray:
-        """Return the point (2,) of the polygon nearest to ``point`` (2,)."""
+        """Return the point (..., 2) of the polygon nearest to ``point`` (..., 2)."""
         return nearest_in_half_planes(self.normals, self.offsets, point)
 
 
 def nearest_in_half_planes(normals: np.ndarray, offsets: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Return the point (2,) nearest to ``point`` (2,) whose dot products with the unit ``normals`` (m, 2) are at most
-    the ``offsets`` (m,).
+    """Return the point (..., 2) nearest to ``point`` (..., 2) whose dot products with the unit ``normals`` (..., m, 2)
+    are at most the ``offsets`` (..., m).
 
     It is the point itself, its projection onto an edge, or the intersection of two edges. If the half planes have no
     common point, it is the candidate that violates them least. A point that is not finite, as in a step without a
     solution, is returned unchanged.
     """
-    outside = normals @ point - offsets
-    if not np.isfinite(point).all() or (outside <= 0.0).all():
-        return point
-    projections = point - outside[:, None] * normals
-    i, j = np.triu_indices(len(normals), 1)
-    determinants = normals[i, 0] * normals[j, 1] - normals[i, 1] * normals[j, 0]
-    crossing = np.abs(determinants) > _TOLERANCE
-    i, j, determinants = i[crossing], j[crossing], determinants[crossing]
-    intersections = (
-        np.stack(
-            [
-                offsets[i] * normals[j, 1] - offsets[j] * normals[i, 1],
-                normals[i, 0] * offsets[j] - normals[j, 0] * offsets[i],
-            ],
-            axis=1,
-        )
-        / determinants[:, None]
+    m = normals.shape[-2]
+    points = np.ascontiguousarray(point.reshape(-1, 2), np.float64)
+    nearest = np.empty_like(points)
+    launch_on(
+        nearest,
+        nearest_kernel,
+        len(points),
+        inputs=[
+            (np.ascontiguousarray(normals.reshape(-1, m, 2)), Vec2),
+            (np.ascontiguousarray(offsets.reshape(-1, m)), real),
+            (points, Vec2),
+        ],
+        outputs=[(nearest, Vec2)],
     )
-    candidates = np.concatenate([projections, intersections])
-    excess = (candidates @ normals.T - offsets).max(axis=1)
-    scale = float(np.abs(offsets).max() + np.abs(point).max())
-    feasible = excess <= max(_TOLERANCE * scale, float(excess.min()))
-    return candidates[feasible][np.argmin(np.linalg.norm(candidates[feasible] - point, axis=1))]
+    return nearest.reshape(point.shape)
 
 
 def is_line(points: np.ndarray) -> bool:
     """Return True if ``points`` (k, 2) span no area."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return len(points) < 3 or bool(spread[1] <= _LINE_TOLERANCE * spread[0])
+    return len(points) < 3 or bool(spread[1] <= float(LINE_TOLERANCE) * spread[0])
+
+
+def _levels(normals: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Return the dot products (..., m) of ``normals`` (..., m, 2) with ``point`` (..., 2)."""
+    return (normals @ point[..., None])[..., 0]
+
+
+def _concatenate_padded(rows: Sequence[np.ndarray]) -> np.ndarray:
+    """Concatenate ``rows`` (c, k, ...) of different width k, padded with their last entries."""
+    widest = max(each.shape[1] for each in rows)
+    return np.concatenate(
+        [np.concatenate([each, np.repeat(each[:, -1:], widest - each.shape[1], axis=1)], axis=1) for each in rows]
+    )

@@ -13,7 +13,7 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpPlan, JumpTarget
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.twist import AIRBORNE_FRACTION, twist
+from egs_warp.motions.twist import AIRBORNE_FRACTION
 
 HEADING_TOLERANCE = np.radians(8.0)
 """Maximum heading error in radians of a landing after which no further jump follows."""
@@ -45,10 +45,10 @@ class Turn:
         self._remaining_turn = turn
         self._remaining_after_jump: float | None = None
         """Predicted or measured remaining turn after the current jump, in radians; None before it is in the air."""
-        first = twist(stance, target, turn)
+        first = Jump(stance, stance.landing(target), turn=turn)
         self.max_turn_per_jump = MAX_TURN_FRACTION * largest_turn(first, stance)
         self._one_jump = abs(turn) <= self.max_turn_per_jump
-        self.jumps = [first if self._one_jump else twist(stance, target, self._next_turn())]
+        self.jumps = [first if self._one_jump else self._twist(stance, target)]
 
     @property
     def expected_time(self) -> float:
@@ -101,13 +101,13 @@ class Turn:
         result = self.jumps[-1].objectives(state, report, dt)
         jump = self.jumps[-1]
         self._remaining_after_jump = (
-            self._remaining_turn - jump.facing.predicted_heading if jump.phase is JumpPhase.FLIGHT else None
+            self._remaining_turn - jump.predicted_heading if jump.phase is JumpPhase.FLIGHT else None
         )
         if jump.phase in (JumpPhase.LAND, JumpPhase.REST):
             # The frame of a landed jump is rotated by the requested turn, so the heading of the feet in it is the
             # error.
             self._remaining_after_jump = (
-                self._remaining_turn - jump.facing.target_heading - jump.controller.sole_heading(state.positions)
+                self._remaining_turn - jump.target_heading - jump.controller.sole_heading(state.positions)
             )
             if jump.is_at_rest and len(self.jumps) < MAX_JUMPS and abs(self._remaining_after_jump) > HEADING_TOLERANCE:
                 self._remaining_turn, self._remaining_after_jump = self._remaining_after_jump, None
@@ -120,6 +120,9 @@ class Turn:
         possible."""
         return self._remaining_turn / float(np.ceil(abs(self._remaining_turn) / self.max_turn_per_jump))
 
+    def _twist(self, stance: Stance, target: JumpTarget) -> Jump:
+        return Jump(stance, stance.landing(target), turn=self._next_turn())
+
     def _next_jump(self, state: BodyState) -> Jump:
         stance = self._stance.moved_to(state.positions)
         offset = self._goal - stance.ground.origin
@@ -128,7 +131,7 @@ class Turn:
             stance = stance.with_forward(offset)
         else:
             distance = 0.0
-        return twist(stance, JumpTarget(distance, self._height), self._next_turn())
+        return self._twist(stance, JumpTarget(distance, self._height))
 
 
 def largest_turn(jump: Jump, stance: Stance) -> float:

@@ -5,13 +5,14 @@ See docs/concepts/motions.md.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from egs_warp.fem.batched import BatchedRecord
+from egs_warp.geometry.frames import dots, times
+from egs_warp.motions.balance import Measurement
 from egs_warp.motions.free_turn import spin_for_rotation
-from egs_warp.motions.jump import Jump
-from egs_warp.motions.jump_plan import JumpTarget
-from egs_warp.motions.sequence import Stance
-from egs_warp.motions.stance import BalanceController, Measurement
 
 AIRBORNE_FRACTION = 0.88
 """Fraction of the planned flight time in which the body is off the ground; it is below 1 because the body stretches
@@ -25,64 +26,87 @@ MAX_WIDTH = 1.15
 """Maximum width of the body in the air relative to standing; the minimum is 1 / ``MAX_WIDTH``."""
 
 
-def twist(stance: Stance, target: JumpTarget, turn: float) -> Jump:
-    """Return a jump that lands with its heading changed by ``turn`` radians, counterclockwise as seen from above."""
-    return Jump(stance, stance.landing(target), facing=TurnHeading(stance, turn))
+@dataclass(frozen=True)
+class Heading(BatchedRecord):
+    """Headings of the jumps of c worlds, radians about the up axis, counterclockwise as seen from above."""
 
+    turns: np.ndarray
+    """(c,) bool, True for jumps that control their heading; the others keep it at 0."""
+    target: np.ndarray
+    """(c,) heading change from the start to the landing."""
+    standing_inertia: np.ndarray
+    """(c, 3, 3) kg m^2, inertia of the body at rest, world axes."""
+    now: np.ndarray
+    """(c,) heading change from the start until now, without wrapping."""
+    predicted: np.ndarray
+    """(c,) predicted ``now`` at touch-down; ``airborne_pose`` updates it."""
 
-class TurnHeading:
-    """Heading policy of a jump that turns."""
-
-    def __init__(self, stance: Stance, turn: float) -> None:
-        self.body, self.target_heading, self.heading, self.predicted_heading = stance.body, turn, 0.0, 0.0
-        self._standing_inertia = stance.body.inertia(stance.standing)
-
-    def update(self, heading: float) -> None:
-        """Update the heading without wrapping, so that full turns are included."""
-        self.heading += float(np.remainder(heading - self.heading + np.pi, 2.0 * np.pi) - np.pi)
+    def update(self, heading: np.ndarray) -> None:
+        """Update the heading from the measured ``heading`` (c,), which is known up to whole turns, without wrapping."""
+        change = np.remainder(heading - self.now + np.pi, 2.0 * np.pi) - np.pi
+        self.now[:] += np.where(self.turns, change, 0.0)
 
     def thrust_momentum(
         self,
-        controller: BalanceController,
+        up: np.ndarray,
         measurement: Measurement,
         upright: np.ndarray,
         *,
-        left: float,
-        flight_time: float,
+        left: np.ndarray,
+        flight_time: np.ndarray,
     ) -> np.ndarray:
-        """Return the angular momentum (3,) in kg m^2/s with which the body becomes upright in the air and turns by the
-        remaining heading change.
+        """Return the angular momentum (c, 3) in kg m^2/s for take-off, with which the body becomes upright in the air
+        and turns by the remaining heading change.
 
-        In the air, the body has approximately its standing shape. Therefore the inertia of the standing body applies,
-        not the inertia of the crouched one.
+        In the air, a body that turns has approximately its standing shape. Therefore the inertia of the standing body
+        applies, not the inertia of the crouched one.
+
+        Args:
+            up: (c, 3) unit up axis.
+            measurement: measured body.
+            upright: (c, 3) rotation vector to the landing pose without the heading change.
+            left: (c,) s, time until take-off.
+            flight_time: (c,) s, duration of the flight, at whose end the body is upright and has turned.
         """
-        up, rotation = controller.ground.axes[2], measurement.rotation
-        inertia = rotation @ self._standing_inertia @ rotation.T
-        momentum = float(up @ measurement.angular_momentum)
-        spinning = momentum / float(up @ inertia @ up)
-        airborne = AIRBORNE_FRACTION * flight_time + 0.5 * left
-        turn = SPIN_FACTOR * self._remaining_turn() - 0.5 * left * spinning
-        return inertia @ spin_for_rotation(inertia, upright, turn * up, airborne)
+        momenta = times(measurement.inertia, upright / flight_time[:, None])
+        rows = np.flatnonzero(self.turns)
+        if len(rows) == 0:
+            return momenta
+        part, up, left = self.gather(rows), up[rows], left[rows]
+        rotation = measurement.rotation[rows]
+        inertia = rotation @ part.standing_inertia @ rotation.swapaxes(1, 2)
+        spinning = dots(up, measurement.angular_momentum[rows]) / dots(up, times(inertia, up))
+        airborne = AIRBORNE_FRACTION * flight_time[rows] + 0.5 * left
+        turn = SPIN_FACTOR * part._remaining_turn() - 0.5 * left * spinning
+        spin = spin_for_rotation(inertia, upright[rows], turn[:, None] * up, airborne)
+        momenta[rows] = times(inertia, spin)
+        return momenta
 
-    def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:
-        """Widen or narrow ``pose`` so that the present spin completes the remaining turn, as skaters do with their
-        arms."""
-        to_turn, turning = self._remaining_turn(), float(up @ momentum) * left / float(up @ self._standing_inertia @ up)
-        self.predicted_heading = self.heading + turning
-        ratio = turning / to_turn if turning * to_turn > 0.0 else np.inf
-        width = float(np.sqrt(np.clip(ratio, 1.0 / MAX_WIDTH**2, MAX_WIDTH**2)))
-        return pose @ (width * np.eye(3) + (1.0 - width) * np.outer(up, up))
+    def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: np.ndarray) -> np.ndarray:
+        """Widen or narrow the pose of bodies that turn, so that the present spin completes the remaining turn, as
+        skaters do with their arms.
 
-    def landed_heading(self, controller: BalanceController, positions: np.ndarray) -> float:
-        """Return the heading of the feet, because the landed body does not correct a missing turn by twisting over its
-        feet."""
-        return controller.sole_heading(positions)
+        Args:
+            pose: (c, 3, 3) pose to adapt.
+            momentum: (c, 3) kg m^2/s, angular momentum, world axes.
+            up: (c, 3) unit up axis.
+            left: (c,) s, time until the landing.
+        """
+        to_turn = self._remaining_turn()
+        turning = dots(up, momentum) * left / dots(up, times(self.standing_inertia, up))
+        self.predicted[:] = np.where(self.turns, self.now + turning, 0.0)
+        is_reachable = turning * to_turn > 0.0
+        ratio = np.where(is_reachable, turning / np.where(is_reachable, to_turn, 1.0), np.inf)
+        width = np.where(self.turns, np.sqrt(np.clip(ratio, 1.0 / MAX_WIDTH**2, MAX_WIDTH**2)), 1.0)[:, None, None]
+        return pose @ (width * np.eye(3) + (1.0 - width) * up[:, :, None] * up[:, None])
 
-    def _remaining_turn(self) -> float:
-        """Return the remaining turn in radians until touch-down, after which the feet still slide by
+    def landed(self, measurement: Measurement) -> np.ndarray:
+        """Return the target heading (c,) of landed bodies relative to the landing frame: that of the feet, because a
+        body does not correct a missing turn by twisting over its feet; 0 for jumps that keep their heading."""
+        return np.where(self.turns, measurement.sole_heading, 0.0)
+
+    def _remaining_turn(self) -> np.ndarray:
+        """Return the remaining turn (c,) in radians until touch-down, after which the feet still slide by
         ``LANDING_SLIDE_ANGLE``."""
-        return (
-            self.target_heading
-            - np.sign(self.target_heading) * min(LANDING_SLIDE_ANGLE, abs(self.target_heading))
-            - self.heading
-        )
+        slide = np.sign(self.target) * np.minimum(LANDING_SLIDE_ANGLE, np.abs(self.target))
+        return self.target - slide - self.now

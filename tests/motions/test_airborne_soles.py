@@ -9,34 +9,46 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.objectives import BodyPart, Objective
+from egs_warp.locomotion.objectives import AnyObjective, BodyPart, Objective
+from egs_warp.locomotion.reduced_objectives import ReducedObjectives
 from egs_warp.motions.airborne_soles import BASE_SWING_WEIGHT, BASE_TILT_WEIGHT, AirborneSoles
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.stance import BalanceController
+from egs_warp.motions.stance import BalanceController, sole_shares
 from tests.support.stances import block_place
 
+RATE = 3.0
 
-def airborne(place: Stance, turn: Rotation) -> tuple[BodyState, BalanceController, BodyPart]:
-    """Return the state of a standing body whose base alone was rotated, its controller and its base."""
-    controller = BalanceController(place.body, place.ground, place.standing, place.contact_points, place.friction)
-    (base,) = AirborneSoles.of(place, place.feet(), on_legs=False).parts
+
+def airborne(place: Stance, turn: Rotation, *, on_legs: bool) -> tuple[BodyState, BodyPart, list[AnyObjective]]:
+    """Return the state of a standing body whose base alone was rotated, its base, and the objectives of its soles for
+    the pose at rest, a rate of 3 / s and half of the weights."""
+    feet = place.feet()
+    soles = [foot.sole for foot in feet] if on_legs else []
+    controller = BalanceController(
+        place.body, place.ground, place.standing, place.contact_points, place.friction, soles=soles
+    )
+    base = BodyPart.of(place.body, "sole", np.flatnonzero(sole_shares(place.body, place.ground, place.standing)))
     positions = place.standing.copy()
     centre = base.centre(positions)
     positions[base.nodes] = centre + turn.apply(positions[base.nodes] - centre)
-    return BodyState(positions, np.zeros_like(positions)), controller, base
+    state = BodyState(positions, np.zeros_like(positions))
+    moments = controller.reduced(state, None).moments
+    airborne_soles = AirborneSoles.of(place, feet, on_legs=on_legs)
+    affine = airborne_soles.objectives(controller.balance, moments, np.eye(3), np.asarray(RATE), np.asarray(0.5))
+    reduced = ReducedObjectives(affine, np.zeros(3), np.asarray(0.0)).with_world_axis()
+    return state, base, reduced.of_one_world(controller.shares, positions)
 
 
 @pytest.mark.parametrize(("tilt", "yaw"), [(0.3, 0.0), (-0.2, 0.0), (0.0, 0.4)])
 def test_a_base_is_turned_flat_but_not_about_the_up_axis(tilt: float, yaw: float) -> None:
     """The target rate is the sine of the tilt times the rate of approach, against the tilt. The whole body is also
     turned about the up axis."""
-    place, rate = block_place(), 3.0
+    place = block_place()
     turn = Rotation.from_rotvec([0.0, 0.0, yaw]) * Rotation.from_rotvec(tilt * place.ground.axes[1])
-    state, controller, base = airborne(place, turn)
-    soles = AirborneSoles.of(place, place.feet(), on_legs=False)
-    move, flatten = (cast(Objective, one) for one in soles.objectives(controller, state, np.eye(3), rate, 0.5))
+    state, base, objectives = airborne(place, turn, on_legs=False)
+    _, move, flatten = (cast(Objective, one) for one in objectives)
     assert (move.weight, flatten.weight) == (0.5 * BASE_SWING_WEIGHT, 0.5 * BASE_TILT_WEIGHT)
-    spin = np.array([0.0, -rate * np.sin(tilt)])
+    spin = np.array([0.0, -RATE * np.sin(tilt)])
     radius = np.sqrt(0.5 * np.trace(base.inertia(state.positions)) / base.masses.sum())
     assert np.allclose(flatten.target, radius * spin, atol=1e-9)
     # A rigid rotation of the base at this rate meets the target.
@@ -45,7 +57,9 @@ def test_a_base_is_turned_flat_but_not_about_the_up_axis(tilt: float, yaw: float
 
 
 def test_feet_on_legs_are_only_moved() -> None:
+    """There are three rows for each foot."""
     place = block_place()
-    soles = AirborneSoles.of(place, place.feet(), on_legs=True)
-    state, controller, _ = airborne(place, Rotation.from_rotvec([0.0, 0.3, 0.0]))
-    assert len(soles.objectives(controller, state, np.eye(3), 1.0, 1.0)) == len(place.feet())
+    _, _, objectives = airborne(place, Rotation.from_rotvec([0.0, 0.3, 0.0]), on_legs=True)
+    moves = [one for one in objectives if isinstance(one, Objective)]
+    assert {one.name for one in moves} == {"sole velocity"}
+    assert sum(len(one.target) for one in moves) == 3 * len(place.feet())

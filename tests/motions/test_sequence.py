@@ -19,7 +19,6 @@ from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence, MotionTask, Stance
 from egs_warp.motions.turn import Turn
-from egs_warp.motions.twist import twist
 from tests.support.stances import DT, moved
 
 
@@ -69,7 +68,7 @@ def test_motions_jump_onto_the_solid_ahead(place: Stance, name: str) -> None:
     step = Solid((Plane(np.array([0.0, 0.0, 1.0]), -0.1), Plane(np.array([-1.0, 0.0, 0.0]), 0.3)))
     ground = Solid((Plane(np.array([0.0, 0.0, 1.0]), 0.0),))
     target, stepped = JumpTarget(0.5, 0.2), replace(place, solids=(ground, step))
-    begun = motion("jump 0.5 0.2").parts(1.0)[0].begin(stepped) if name == "jump" else twist(stepped, target, 0.5)
+    begun = motion("jump 0.5 0.2").parts(1.0)[0].begin(stepped) if name == "jump" else Turn(stepped, target, 0.5).jumps[0]
     assert isinstance(begun, Jump) and begun.target.rise == pytest.approx(0.1)
 
 
@@ -148,7 +147,7 @@ def test_a_script_becomes_parts(place: Stance) -> None:
     assert [part.name for part in parts] == ["hop", "hop", "hop", "twist", "jump", "jump"]
     assert [part.asked.get("square") for part in parts[:3]] == [1.0, 2.0, 3.0]
     turn = parts[3].begin(place)
-    assert isinstance(turn, Turn) and turn.jumps[0].facing.target_heading == pytest.approx(np.pi / 2)
+    assert isinstance(turn, Turn) and turn.jumps[0].target_heading == pytest.approx(np.pi / 2)
     jump = parts[4].begin(place)
     assert isinstance(jump, Jump) and jump.target.distance == pytest.approx(0.5 * place.body.height)
     assert script.frames() == 3 * motion("hop").frames() + motion("twist, jump x2").frames()

@@ -16,11 +16,11 @@ def test_jumps_are_short_and_turn_to_alternate_sides() -> None:
     skip = Skip(place, 0.9, 0.12)
     planned = skip.plan_record()
     assert (planned.jumps, planned.length) == (3.0, pytest.approx(0.3)) and planned.turn_degrees > 3.0
-    headings = [skip.jumps[0].facing.target_heading]
+    headings = [skip.jumps[0].target_heading]
     forward = place.ground.axes[0]
     for number in (2, 3):
         jump = skip._next(place.moved_to(place.standing + (number - 1) * 0.3 * forward), place.standing, number)
-        headings.append(jump.facing.target_heading)
+        headings.append(jump.target_heading)
     assert np.allclose(np.degrees(headings), np.array([-1.0, 1.0, 0.0]) * planned.turn_degrees)
     assert Skip(place, 0.1, 0.12).plan_record().jumps == 2.0
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from egs_warp.fem.body import BodyState
+from egs_warp.motions.balance import SUPPORT_MARGIN, Measurement, _share_in_cone
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.stance import SOLE_HEIGHT, SUPPORT_MARGIN, BalanceController, Measurement, _share_in_cone
+from egs_warp.motions.stance import SOLE_HEIGHT, BalanceController
 
 GRAVITY, EDGE, DT = 9.81, 0.2, 1 / 60
 

@@ -12,14 +12,15 @@ from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.turn import Turn, largest_turn
-from egs_warp.motions.twist import twist
 from tests.support.stances import DT, moved
 
 
 def land(jump: Jump, state: BodyState) -> None:
     """Set the state of a jump to that after its landing, one step before it rests."""
-    jump.phase, jump._entered = JumpPhase.LAND, -100.0
-    jump.controller = jump._landing
+    jump.phase = JumpPhase.LAND
+    worlds = jump._worlds
+    worlds.current.scatter(np.array([0]), worlds.landing)
+    worlds.entered[:], worlds.is_airborne[:] = -100.0, True
 
 
 def test_a_turn_that_falls_short_is_completed_at_its_start(place: Stance) -> None:
@@ -32,7 +33,7 @@ def test_a_turn_that_falls_short_is_completed_at_its_start(place: Stance) -> Non
     turn.objectives(state, None, DT)
     assert len(turn.jumps) == 2
     second = turn.jumps[1]
-    assert np.degrees(second.facing.target_heading) == pytest.approx(25.0) and second.target.distance == pytest.approx(
+    assert np.degrees(second.target_heading) == pytest.approx(25.0) and second.target.distance == pytest.approx(
         0.1
     )
     assert np.allclose(second.ground.axes[0], [-1.0, 0.0, 0.0])
@@ -49,12 +50,12 @@ def test_a_slippery_floor_takes_more_jumps(place: Stance) -> None:
     rough, smooth = (Turn(replace(place, friction=mu), target, np.pi) for mu in (0.8, 0.2))
     assert smooth.max_turn_per_jump == pytest.approx(rough.max_turn_per_jump / 4.0)
     count = np.ceil(np.pi / smooth.max_turn_per_jump)
-    assert count >= 2.0 and smooth.jumps[0].facing.target_heading == pytest.approx(np.pi / count)
-    landed = moved(place, smooth.jumps[0].facing.target_heading, np.zeros(3))
+    assert count >= 2.0 and smooth.jumps[0].target_heading == pytest.approx(np.pi / count)
+    landed = moved(place, smooth.jumps[0].target_heading, np.zeros(3))
     state = BodyState(landed, 0 * landed, 10.0)
     land(smooth.jumps[0], state)
     smooth.objectives(state, None, DT)
-    assert smooth.jumps[1].facing.target_heading == pytest.approx(np.pi / count)
+    assert smooth.jumps[1].target_heading == pytest.approx(np.pi / count)
     assert smooth.notes()[0] == f"friction allows a turn of {np.degrees(smooth.max_turn_per_jump):.0f} degrees per jump"
 
 
@@ -71,7 +72,7 @@ def test_the_largest_turn_is_that_of_a_disc_on_rough_ground(place: Stance, point
     circle = np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
     shares = np.sqrt((np.arange(40) + 0.5) / 40) if points == "disc" else np.ones(1)
     feet = replace(place, friction=mu, contact_points=np.concatenate([radius * share * circle for share in shares]))
-    jump = twist(feet, JumpTarget(0.0, 0.2), 1.0)
+    jump = Jump(feet, JumpTarget(0.0, 0.2), turn=1.0)
     plan, body = jump.plan, place.body
     thrust = (np.arange(1000) + 0.5) / 1000 * plan.thrust_time
     load = body.mass * (9.81 + plan.speed_up / plan.thrust_time) * np.ones_like(thrust)

@@ -9,10 +9,11 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
-from egs_warp.motions.jump import FORWARD_TIME_FRACTION, Jump
+from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
+from egs_warp.motions.jump_worlds import FORWARD_TIME_FRACTION
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.twist import AIRBORNE_FRACTION, LANDING_SLIDE_ANGLE, SPIN_FACTOR, twist
+from egs_warp.motions.twist import AIRBORNE_FRACTION, LANDING_SLIDE_ANGLE, SPIN_FACTOR
 from tests.support.meshes import box_mesh
 from tests.support.stances import DT, block_place, moved
 
@@ -39,7 +40,7 @@ def test_a_twist_requests_the_remaining_spin_from_friction(turn: float) -> None:
     symmetric, so the target that corrects its tilt has no momentum about the up axis.
     """
     place = block_place(box_mesh((2, 2, 4), (0.4, 0.4, 1.0)))
-    jump = twist(place, JumpTarget(0.0, 0.2), turn)
+    jump = Jump(place, JumpTarget(0.0, 0.2), turn=turn)
     jump.phase = JumpPhase.THRUST
     rising, sign = np.zeros_like(place.standing), np.sign(turn)
     rising[:, 2] = 0.9 * jump.plan.speed_up
@@ -57,7 +58,7 @@ def test_a_twist_requests_the_remaining_spin_from_friction(turn: float) -> None:
     assert sign * yaw_asked(jump, BodyState(crouched, rising, 0.0)) == pytest.approx(asked[-1], rel=1e-6)
     for angle in np.linspace(0.6, abs(turn), 12) * sign:
         jump.objectives(BodyState(moved(place, angle, np.zeros(3)), rising, 0.0), None, DT)
-    assert jump.facing.heading == pytest.approx(turn)
+    assert jump.heading == pytest.approx(turn)
 
 
 def test_a_twist_spins_up_with_the_upward_speed(place: Stance) -> None:
@@ -65,7 +66,7 @@ def test_a_twist_spins_up_with_the_upward_speed(place: Stance) -> None:
     body that rises at half of the take-off speed therefore gets twice the target of a body at rest."""
     shares = []
     for risen in (0.0, 0.5):
-        jump = twist(place, JumpTarget(0.0, 0.2), 1.0)
+        jump = Jump(place, JumpTarget(0.0, 0.2), turn=1.0)
         jump.phase = JumpPhase.THRUST
         velocities = np.zeros_like(place.standing)
         velocities[:, 2] = risen * jump.plan.speed_up
@@ -90,7 +91,7 @@ def test_in_the_air_the_width_is_adjusted_to_the_turn(place: Stance) -> None:
     fitting = left / time
     rates = []
     for width in (1.0, 1.05, 0.95):
-        jump = twist(place, JumpTarget(0.0, 0.2), turn)
+        jump = Jump(place, JumpTarget(0.0, 0.2), turn=turn)
         jump.phase = JumpPhase.THRUST
         spin = fitting * width**2
         velocities = np.cross([0.0, 0.0, spin], arms) + [0.0, 0.0, speed]
