@@ -10,8 +10,8 @@ positions of a node in the two runs, in body heights. Time by stage is measured 
 which every stage synchronises the device.
 
 With ``--planned``, each world plans a jump over its own distance (0.2 to 0.7 body heights) in a closed loop instead:
-its motion, a Python object, computes the objectives of each step from the state at its start. The stage ``objectives``
-is the time of the motions and the transfers that they need; the rate without this stage is stored, too.
+``MotionBatch`` computes the objectives of each step from the states at its start. The stage ``objectives`` is the time
+of the motions and the transfers that they need; the rate without this stage is stored, too.
 
 ``--matrices B`` also measures, in ms, the factorisation of B dense matrices of the size of each cage, with panels of
 several widths and with the Cholesky factorisation of PyTorch, and solutions for 1 and 96 right-hand sides.
@@ -36,10 +36,10 @@ import torch
 from egs_warp.assets import pawn
 from egs_warp.fem.panel_cholesky import PanelCholesky
 from egs_warp.locomotion.batch import BatchStepper
-from egs_warp.locomotion.batch_objectives import BatchObjectives
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
+from egs_warp.motions.motion_batch import MotionBatch
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from egs_warp.pipelines.creature import Creature, CreatureOptions, initial_stance, make_creature
@@ -156,23 +156,18 @@ def measure_planned(creature: Creature, worlds: int, *, steps: int, alone: int, 
         stages=watch,
         planner=single.planner,
     )
-    motions = [_jump(creature, distance) for distance in distances]
-    state, states = stepper.start([creature.start] * worlds), [creature.start] * worlds
-    reports: list[StepReport | None] = [None] * worlds
+    motions = MotionBatch(creature.body, [_jump(creature, distance) for distance in distances], device)
+    state = stepper.start([creature.start] * worlds)
     halved, started, first = 0, watch.now(), 0.0
     for number in range(steps):
         with watch("objectives"):
-            current = zip(motions, states, reports, strict=True)
-            each = [jump.objectives(start, last, dt) for jump, start, last in current]
-            objectives = BatchObjectives.stack(each, len(states[0].positions), device)
+            objectives = motions.objectives(state, dt)
         state, done, failed = stepper.advance(state, objectives, dt)
         if bool(failed.any()):
             raise RuntimeError(f"{int(failed.sum())} worlds of {worlds} could not be solved in step {number}")
         halved += worlds - int(torch.as_tensor(done[0].report.converged).sum()) if done[0].report.dt == dt else worlds
         with watch("objectives"):
-            for step in done:
-                for world, report in zip(step.worlds.tolist(), step.reports(), strict=True):
-                    reports[world], states[world] = report, report.state
+            motions.finish_step(done)
         if number == 0:
             # The first step compiles kernels and allocates memory.
             first = watch.now() - started

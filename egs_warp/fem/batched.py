@@ -68,6 +68,31 @@ class BatchedRecord:
         rows = zip(*columns.values(), strict=True)
         return [replace(self, **dict(zip(columns, row, strict=True))) for row in rows]
 
+    def on_host(self) -> Self:
+        """Return this record of c worlds with NumPy arrays of float64, with one transfer from the device."""
+        leaves = self._leaves()
+        flat = sys.modules["torch"].cat([each.reshape(len(each), -1).double() for each in leaves], dim=1).cpu().numpy()
+        widths = np.cumsum([each[0].numel() for each in leaves])
+        columns = np.split(flat, widths[:-1], axis=1)
+        return self._with_leaves([part.reshape(each.shape) for part, each in zip(columns, leaves, strict=True)])
+
+    def _leaves(self) -> list[Any]:
+        """Return the arrays of this record and of its nested records."""
+        leaves = []
+        for _, value in self.batched_fields():
+            leaves += value._leaves() if isinstance(value, BatchedRecord) else [value]
+        return leaves
+
+    def _with_leaves(self, leaves: list[Any]) -> Self:
+        """Return this record with other ``leaves``, in the order of ``_leaves``; they are removed from the list."""
+        return replace(
+            self,
+            **{
+                name: value._with_leaves(leaves) if isinstance(value, BatchedRecord) else leaves.pop(0)
+                for name, value in self.batched_fields()
+            },
+        )
+
     def batched_fields(self) -> list[tuple[str, Any]]:
         """Return names and values of the fields that are arrays or records of arrays."""
         values = [(field.name, getattr(self, field.name)) for field in fields(self)]

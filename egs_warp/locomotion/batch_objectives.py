@@ -52,6 +52,29 @@ class BatchObjectives(BatchedRecord):
             upload(loads),
         )
 
+    @classmethod
+    def merged(cls, parts: Sequence[tuple[torch.Tensor, BatchObjectives]], count: int) -> BatchObjectives:
+        """Return the objectives of ``count`` worlds; each part has those of some worlds, whose numbers come first."""
+        first_rows, first = parts[0]
+        if len(first_rows) == count:
+            return first
+
+        def merge(values: Sequence[tuple[torch.Tensor, torch.Tensor]]) -> torch.Tensor:
+            width = max(each.shape[1] for _, each in values)
+            one = values[0][1]
+            merged = one.new_zeros(count, width, *one.shape[2:])
+            for rows, each in values:
+                merged[rows, : each.shape[1]] = each
+            return merged
+
+        names = [name for name, _ in first.rows.batched_fields()]
+        rows = {name: merge([(at, getattr(part.rows, name)) for at, part in parts]) for name in names}
+        others = {
+            name: merge([(at, getattr(part, name)) for at, part in parts])
+            for name in ("momentum_weights", "momentum_targets", "load_weights")
+        }
+        return cls(WeightedRows(**rows), **others)
+
     def form(self, problem: BatchProblem, contacts: ContactSet, velocities: torch.Tensor, m: int) -> torch.Tensor:
         """Return the quadratic form (c, k + 1, k + 1) of the cost in (x, 1), see ``step_cost.objectives_cost``.
 

@@ -221,13 +221,17 @@ class MotionSequence:
         """Return the objectives of the current motion for the time step of ``dt`` seconds from ``state``; start the
         next motion if the current one has ended."""
         if self._parts and (not self.done or self._resting):
-            stance = self._stance.next_stance(state.positions, report) if self.done else self._stance
-            if stance.base() is SupportKind.ROUND_BASE:
-                self._stance = stance
-            part = self._parts.pop(0)
-            self._is_dropped = self._gets_up_next = False
-            self.done.append(MotionRecord(part.name, part.asked, part.begin(stance), state.time))
+            self.start_next(state, report)
         return self.done[-1].motion.objectives(state, report, dt)
+
+    def start_next(self, state: BodyState, report: StepReport | None) -> None:
+        """Start the next motion at ``state``; ``report`` is the report of the previous step."""
+        stance = self._stance.next_stance(state.positions, report) if self.done else self._stance
+        if stance.base() is SupportKind.ROUND_BASE:
+            self._stance = stance
+        part = self._parts.pop(0)
+        self._is_dropped = self._gets_up_next = False
+        self.done.append(MotionRecord(part.name, part.asked, part.begin(stance), state.time))
 
     def time_left(self, time: float, expected: Sequence[float]) -> float:
         """Estimate the time in seconds from ``time`` s until the body is at rest after the last motion; ``expected``
