@@ -117,7 +117,9 @@ class ReducedObjectives(BatchedRecord):
         return objectives
 
 
-def centre_of_mass_objectives(parts: int, axes: np.ndarray, velocity: np.ndarray, weights: np.ndarray) -> AffineObjectives:
+def centre_of_mass_objectives(
+    parts: int, axes: np.ndarray, velocity: np.ndarray, weights: np.ndarray
+) -> AffineObjectives:
     """Return three objectives on the velocity of the centre of mass along ``axes``.
 
     Args:
@@ -131,9 +133,7 @@ def centre_of_mass_objectives(parts: int, axes: np.ndarray, velocity: np.ndarray
     return AffineObjectives(("com",) * 3, coefficients, velocity, weights)
 
 
-def strain_objectives(
-    parts: int, second: np.ndarray, target: np.ndarray, weight: np.ndarray
-) -> AffineObjectives:
+def strain_objectives(parts: int, second: np.ndarray, target: np.ndarray, weight: np.ndarray) -> AffineObjectives:
     """Return six objectives on the mean rates of stretch and shear, see ``objectives.deformation_velocities``.
 
     Args:

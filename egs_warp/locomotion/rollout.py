@@ -168,6 +168,8 @@ class StepRequest:
     """(M,) m, prescribed activations; None plans them from the objectives."""
     dt: float
     """Step size, s."""
+    motion: Motion
+    """Source of the objectives."""
 
     def advance(self, stepper: LocomotionStepper) -> list[StepReport]:
         """Make the step with ``stepper``. Return its reports; an empty list if neither the step nor a part of it can be
@@ -280,7 +282,7 @@ def rollout_steps(
             step_activations = None if activations is None else activations[frame * per_frame + part]
             state, done = run.begin_step(objectives, dt, step_activations)
             if not done:
-                done = yield StepRequest(state, run.memory, objectives, step_activations, dt)
+                done = yield StepRequest(state, run.memory, objectives, step_activations, dt, motion)
             stopped = not done
             if stopped:
                 break

@@ -307,8 +307,8 @@ class Act:
             base = BodyPart.base(stance.body, heights)
             self._base = base, stance.standing[base.nodes]
         postures = [layer.posture(elapsed - layer.begin + dt) for layer in active if layer.gesture.moves_whole_body]
-        self._stand.posture = sum_postures(postures) if postures else None
-        self._stand.controller.gesture_turn = turn
+        self._stand.set_posture(sum_postures(postures) if postures else None)
+        self._stand.gesture_turn = turn
         rules = self._stand.objectives(state, report, dt)
         if not active or self._base is None:
             return rules

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import fields, replace
 
 import numpy as np
 
-from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.objectives import AnyObjective
-from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.airborne_soles import AirborneSoles
 from egs_warp.motions.balance import Weights
+from egs_warp.motions.joined_motion import JoinedMotion
 from egs_warp.motions.jump_plan import (
     LANDING_TIME,
     LEAN_FRACTION,
@@ -35,7 +32,7 @@ depends on their width. The second is for a single base without a turn: with a w
 0.76 m g H of work in the air; with 0.3, they do 0.30 m g H, and the pawn lands equally well."""
 
 
-class Jump:
+class Jump(JoinedMotion[JumpWorlds]):
     """Jump: settle, crouch, thrust until the measured speed suffices, fly, land ``target.distance`` ahead, and come to
     rest. Its state is a row of ``JumpWorlds``, which may be shared with the jumps of other worlds."""
 
@@ -90,7 +87,9 @@ class Jump:
         self.plan = self._plan_for(target)
         airborne = AIRBORNE_POSE_WEIGHT if on_legs or self.target_heading else BASE_AIRBORNE_POSE_WEIGHT
         airborne_soles = AirborneSoles.of(stance, feet, on_legs=on_legs)
-        self._worlds, self._row = self._one_world(stance, airborne_soles, turn, airborne, skips_settling), 0
+        super().__init__(
+            self.take_off_controller, self._one_world(stance, airborne_soles, turn, airborne, skips_settling)
+        )
 
     def _one_world(
         self, stance: Stance, soles: AirborneSoles, turn: float | None, airborne: float, skips_settling: bool
@@ -140,15 +139,6 @@ class Jump:
             overran=np.zeros((1, len(PHASES)), bool),
         )
 
-    @staticmethod
-    def join(jumps: Sequence[Jump]) -> JumpWorlds:
-        """Join the states of ``jumps`` of one body into one record of as many worlds, which they share afterwards."""
-        rows = [jump._worlds.gather(np.array([jump._row])) for jump in jumps]
-        worlds = JumpWorlds.concatenated(rows)
-        for row, jump in enumerate(jumps):
-            jump._worlds, jump._row = worlds, row
-        return worlds
-
     @property
     def phase(self) -> JumpPhase:
         """Current phase."""
@@ -176,15 +166,6 @@ class Jump:
     @landing_height.setter
     def landing_height(self, height: float) -> None:
         self._worlds.landing_height[self._row] = height
-
-    @property
-    def gesture_turn(self) -> np.ndarray:
-        """(3,) rotation vector of the body that is caused by gestures of its parts, see ``Balance.gesture_turn``."""
-        return self._worlds.current.gesture_turn[self._row]
-
-    @gesture_turn.setter
-    def gesture_turn(self, turn: np.ndarray) -> None:
-        self._worlds.current.gesture_turn[self._row] = turn
 
     @property
     def controller(self) -> BalanceController:
@@ -252,12 +233,3 @@ class Jump:
         }
         overran = self._worlds.overran[self._row]
         return [f"{phase.value} took too long: {why}" for phase, why in named.items() if overran[PHASES.index(phase)]]
-
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
-        if len(self._worlds.phase) > 1:
-            self.join([self])
-        start = self.take_off_controller
-        reduced = self._worlds.step(start.reduced(state, report).with_world_axis(), dt)
-        return reduced.of_one_world(start.shares, state.positions)

@@ -17,6 +17,7 @@ from egs_warp.motions.airborne_soles import AirborneSoles
 from egs_warp.motions.balance import Balance, Measurement, Weights, solved
 from egs_warp.motions.free_turn import rotations_of
 from egs_warp.motions.jump_plan import SETTLE_TIME, JumpPhase, JumpPlan, stopping_time, sufficient_speed
+from egs_warp.motions.joined_motion import MotionWorlds
 from egs_warp.motions.moments import ReducedState
 from egs_warp.motions.stance import update_rest
 from egs_warp.motions.support import nearest_in_half_planes
@@ -83,8 +84,9 @@ class _Targets(BatchedRecord):
 
 
 @dataclass(frozen=True)
-class JumpWorlds(BatchedRecord):
-    """Jumps of c worlds with the same body. The fields from ``current`` on change in every step, in place."""
+class JumpWorlds(MotionWorlds):
+    """Jumps of c worlds with the same body. The balance is in the frame of the start until take-off, in the frame of
+    the landing afterwards. The fields from ``is_airborne`` on change in every step, in place."""
 
     speed_unit: float
     """sqrt(g H), m/s."""
@@ -115,8 +117,6 @@ class JumpWorlds(BatchedRecord):
     """(c,) bool, True if the crouch starts at the first time step."""
     landing_height: np.ndarray
     """(c,) m, height at which the centre of mass of the landed body comes to rest."""
-    current: Balance
-    """Balance in the frame of the start until take-off, in the frame of the landing afterwards."""
     is_airborne: np.ndarray
     """(c,) bool, True from take-off on."""
     heading: Heading
@@ -136,6 +136,11 @@ class JumpWorlds(BatchedRecord):
     """(c,) s, time since which the body is slow, see ``update_rest``."""
     overran: np.ndarray
     """(c, phases) bool, True for phases that took too long."""
+
+    @property
+    def is_resting(self) -> np.ndarray:
+        """(c,) bool, True for bodies that have landed and are at rest."""
+        return self.phase == _REST
 
     def step(self, state: ReducedState, dt: float) -> ReducedObjectives:
         """Return the objectives of the time step of ``dt`` seconds from ``state`` and advance the state machines."""

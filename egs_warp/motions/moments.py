@@ -6,7 +6,7 @@ PyTorch tensors of many worlds on a device.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -55,9 +55,7 @@ def part_moments(shares: Array, reference: Array, positions: Array, velocities: 
     turning = products[..., 0, :, 6:]
     turning = turning - turning.swapaxes(-1, -2)
     spin = lib.stack([turning[..., 1, 2], turning[..., 2, 0], turning[..., 0, 1]], -1)
-    return PartMoments(
-        centre[..., None, :] + middles, means[..., 0, 6:], spin, products[..., :3], products[..., 3:6]
-    )
+    return PartMoments(centre[..., None, :] + middles, means[..., 0, 6:], spin, products[..., :3], products[..., 3:6])
 
 
 @dataclass(frozen=True)
@@ -77,6 +75,12 @@ class ReducedState(BatchedRecord):
     """(...,) N, sum of the normal contact forces."""
     gap: Any
     """(...,) m, height of the lowest contact point above the ground."""
+
+    def with_capacity(self, capacity: int) -> ReducedState:
+        """Return the reduced state of one world on the host, its contact points padded with zeros to ``capacity``."""
+        points = np.zeros((capacity, 3))
+        points[: len(self.contact_points)] = self.contact_points
+        return replace(self, contact_points=points)
 
 
 def contact_positions(contacts: ContactSet, positions: Array) -> Array:

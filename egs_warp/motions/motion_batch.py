@@ -1,7 +1,7 @@
 """Motions of many worlds of one body on a device.
 
-Jumps are computed for all worlds at once: the device reduces each state to some hundred numbers, one transfer brings
-them to the host, the state machines run with a world axis (``JumpWorlds``), and a kernel makes the rows of the
+Standing, jumps, hops and twists are computed for all worlds at once: the device reduces each state to some hundred numbers, one transfer brings
+them to the host, the state machines run with a world axis (``MotionWorlds``), and a kernel makes the rows of the
 objectives. Other motions are evaluated one world after the other.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,16 +22,11 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.reduced_objectives import ReducedObjectives
 from egs_warp.locomotion.step_tensors import WeightedRows
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.motions.hop import Hop
-from egs_warp.motions.jump import Jump
-from egs_warp.motions.jump_plan import JumpPhase
-from egs_warp.motions.jump_worlds import PHASES, JumpWorlds
+from egs_warp.motions.current_motion import joined_motion
+from egs_warp.motions.joined_motion import JoinedMotion, MotionWorlds
 from egs_warp.motions.moments import ReducedState, contact_positions, part_moments
-from egs_warp.motions.sequence import BodyMotion, MotionSequence
-from egs_warp.motions.turn import Turn
+from egs_warp.motions.sequence import MotionSequence
 from egs_warp.render.autograd import torch_stream
-
-_REST = PHASES.index(JumpPhase.REST)
 
 
 @dataclass(frozen=True)
@@ -52,13 +48,13 @@ class _Contacts(BatchedRecord):
 
 
 @dataclass
-class _JumpGroup:
-    """Jumps of worlds whose parts have the same shares in the nodes."""
+class _Group:
+    """Motions of one kind in worlds whose parts have the same shares in the nodes."""
 
     worlds: list[int]
     """(k,) worlds, ascending."""
-    jumps: JumpWorlds
-    """Their jumps."""
+    motions: MotionWorlds
+    """Their motions."""
     rows: torch.Tensor
     """(k,) rows of these worlds in the state."""
     shares: torch.Tensor
@@ -79,7 +75,7 @@ class _JumpGroup:
             load=contacts.load,
             gap=contacts.gap,
         )
-        objectives = self.jumps.step(reduced.on_host(), dt)
+        objectives = self.motions.step(reduced.on_host(), dt)
         return self._on_device(objectives, moments.centres[:, 0], positions)
 
     def _on_device(
@@ -128,7 +124,7 @@ class MotionBatch:
         self._steps: Sequence[BatchStep] = ()
         self._up = torch.as_tensor(-body.gravity / np.linalg.norm(body.gravity), **real)
         self._worlds = list(range(count))
-        self._groups: list[_JumpGroup] | None = None
+        self._groups: list[_Group] | None = None
         self._others: list[int] = []
         """Worlds whose motions are evaluated one after the other."""
 
@@ -173,40 +169,41 @@ class MotionBatch:
                 self._contacts.scatter(step.worlds, found.with_capacity(capacity))
 
     def _has_changed(self) -> bool:
-        """Return True if a jump of a group has come to rest and another motion follows."""
+        """Return True if a motion of a group has come to rest and another motion follows."""
         for group in self._groups or ():
-            resting = np.flatnonzero(group.jumps.phase == _REST)
-            if any(_batched_jump(self._motions[group.worlds[row]]) is None for row in resting):
+            resting = np.flatnonzero(group.motions.is_resting)
+            if any(joined_motion(self._motions[group.worlds[row]]) is None for row in resting):
                 return True
         return False
 
     def _form_groups(self, state: BatchState) -> None:
-        """Sort the worlds into groups of jumps and others; start the first motion of each world."""
-        by_shares: dict[bytes, list[tuple[int, Jump]]] = {}
+        """Sort the worlds into groups of motions and others; start the first motion of each world."""
+        groups: dict[tuple[type, bytes], list[tuple[int, JoinedMotion[Any]]]] = {}
         self._others = []
         for world in self._worlds:
             motion = self._motions[world]
             if not motion.done:
                 motion.start_next(self._state_of(world, state), None)
-            jump = _batched_jump(motion)
-            if jump is None:
+            joined = joined_motion(motion)
+            if joined is None:
                 self._others.append(world)
             else:
-                by_shares.setdefault(jump.take_off_controller.shares.tobytes(), []).append((world, jump))
+                groups.setdefault((type(joined), joined.reference.shares.tobytes()), []).append((world, joined))
         self._groups = []
-        for members in by_shares.values():
-            worlds, jumps = [world for world, _ in members], [jump for _, jump in members]
-            controllers = [jump.take_off_controller for jump in jumps]
-            reference = np.stack([each.reference for each in controllers])
+        for (kind, _), members in groups.items():
+            worlds, motions = [world for world, _ in members], [motion for _, motion in members]
             self._groups.append(
-                _JumpGroup(
+                _Group(
                     worlds,
-                    Jump.join(jumps),
+                    kind.join(motions),
                     self._rows_of(worlds),
-                    torch.as_tensor(controllers[0].shares, device=self._device),
-                    torch.as_tensor(reference, device=self._device),
+                    self._tensor(motions[0].reference.shares),
+                    self._tensor(np.stack([motion.reference.reference for motion in motions])),
                 )
             )
+
+    def _tensor(self, values: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(values, device=self._device)
 
     def _rows_of(self, worlds: list[int]) -> torch.Tensor:
         """Return the rows (k,) of ``worlds`` in the state."""
@@ -227,16 +224,3 @@ class MotionBatch:
             if len(rows) > 0:
                 (report,) = step.subset(rows).reports()
         return self._motions[world].objectives(self._state_of(world, state), report, dt)
-
-
-def _batched_jump(sequence: MotionSequence) -> Jump | None:
-    """Return the jump that alone determines the objectives of the current motion of ``sequence``; None if another
-    motion is running or follows."""
-    if not sequence.done:
-        return None
-    motion: BodyMotion = sequence.done[-1].motion
-    jump = motion.jumps[-1] if isinstance(motion, Turn) else motion.jump if isinstance(motion, Hop) else motion
-    if not isinstance(jump, Jump):
-        return None
-    may_continue = isinstance(motion, Turn) or not sequence.is_finished
-    return None if jump.is_at_rest and may_continue else jump

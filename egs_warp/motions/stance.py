@@ -30,6 +30,7 @@ REST_TIME = 0.3
 _MIN_FOOTPRINT = 0.01
 """Half width in body heights of the square about the centre of mass that every footprint contains."""
 
+
 @dataclass(frozen=True)
 class GroundFrame:
     """Right-handed frame on a plane; the rows of ``axes`` are forward, left and up."""

@@ -5,15 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.reduced_objectives import ReducedObjectives
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.sequence import Stance
 from egs_warp.motions.balance import Weights
-from egs_warp.motions.stance import REST_SPEED, BalanceController, RestDetector, sole_shares
+from egs_warp.motions.free_turn import rotations_of
+from egs_warp.motions.joined_motion import JoinedMotion, MotionWorlds
+from egs_warp.motions.moments import ReducedState
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import REST_SPEED, BalanceController, sole_shares, update_rest
 
 _RATE = 4.0
 """Rate in sqrt(g / H) at which the centre of mass returns over the feet."""
@@ -50,7 +53,74 @@ class StandOutcome:
     """Largest displacement of the centre of mass along the ground."""
 
 
-class Stand:
+@dataclass(frozen=True)
+class StandWorlds(MotionWorlds):
+    """Standing bodies of c worlds."""
+
+    speed_unit: float
+    """sqrt(g H), m/s."""
+    time_unit: float
+    """sqrt(H / g), s."""
+    height: np.ndarray
+    """(c,) m, target height of the centre of mass."""
+    offset: np.ndarray
+    """(c, 3) m, ``PostureTarget.offset`` of the next time step; the other three fields likewise."""
+    offset_velocity: np.ndarray
+    offset_acceleration: np.ndarray
+    turn: np.ndarray
+    slow_since: np.ndarray
+    """(c,) s, time since which the body is slow, see ``update_rest``."""
+    rests: np.ndarray
+    """(c,) bool, True if the body is at rest."""
+    began: np.ndarray
+    """(c,) s, time of the first step; NaN before."""
+    time: np.ndarray
+    """(c,) s, time of the last step."""
+
+    @property
+    def is_resting(self) -> np.ndarray:
+        """(c,) bool, True for bodies at rest."""
+        return self.rests
+
+    def step(self, state: ReducedState, dt: float) -> ReducedObjectives:
+        """Return the objectives of the time step of ``dt`` seconds from ``state`` and detect rest."""
+        balance, measurement = self.current, self.current.measure(state)
+        self.began[:] = np.where(np.isnan(self.began), state.time, self.began)
+        self.time[:] = state.time
+        is_slow = np.linalg.norm(measurement.velocity, axis=1) <= REST_SPEED * self.speed_unit
+        operands = self.slow_since, measurement.velocity, state.time, self.speed_unit, self.time_unit
+        self.slow_since[:], at_rest = update_rest(*operands)
+        self.rests[:] = at_rest | (self.rests & is_slow)
+        rate = _RATE / self.time_unit
+        feet = measurement.foot_centre
+        goal = np.concatenate([feet - balance.base_offset, self.height[:, None]], axis=1) + self.offset
+        acceleration = rate**2 * (goal - measurement.com) - 2.0 * rate * measurement.velocity
+        acceleration[:, :2] = balance.capture_acceleration(measurement, goal[:, :2])
+        # Feed-forward terms: the errors of both control laws are relative to the moving goal.
+        swaying = np.sqrt(balance.gravity / balance.standing_height)
+        rates = np.stack([swaying, swaying, np.full_like(swaying, rate)], axis=1)
+        acceleration += self.offset_acceleration + 2.0 * rates * self.offset_velocity
+        acceleration[:, 2] = np.maximum(acceleration[:, 2], -0.8 * balance.gravity)
+        velocity = measurement.velocity + dt * acceleration
+        pose = balance.leaning_pose(measurement.com + dt * velocity, feet, measurement.sole_heading)
+        if self.turn.any():
+            axes = balance.axes
+            pose = axes.swapaxes(1, 2) @ rotations_of(self.turn) @ axes @ pose
+        upright = balance.turn_towards(measurement, pose) * 4.0 / self.time_unit
+        velocity, spin = balance.balance_targets(measurement, velocity, upright, dt)
+        return balance.objectives(
+            state.moments,
+            measurement,
+            com_velocity=velocity,
+            pose=pose,
+            pose_rate=np.zeros_like(pose),
+            spin=spin,
+            follow=6.0 / self.time_unit,
+            weights=Weights(),
+        )
+
+
+class Stand(JoinedMotion[StandWorlds]):
     """Balance over the current position of the feet, for example after a jump, for any length of time."""
 
     def __init__(self, stance: Stance, *, at_rest: bool = True, crouch: float = 1.0) -> None:
@@ -61,76 +131,60 @@ class Stand:
             at_rest: True if the previous motion has ended at rest.
             crouch: target height of the centre of mass as a fraction of its standing height.
         """
-        self.body = stance.body
-        self.controller = BalanceController(
+        body = self.body = stance.body
+        controller = BalanceController(
             stance.body, stance.ground, stance.standing, stance.contact_points, stance.friction
         )
-        self._gravity = float(np.linalg.norm(stance.body.gravity))
-        self._time_unit = float(np.sqrt(stance.body.height / self._gravity))
-        self._height = crouch * self.controller.standing_height
-        self.posture: PostureTarget | None = None
-        """Posture of the next time step; None for the upright posture."""
-        self._rest_detector = RestDetector(stance.body)
-        self._is_resting = at_rest
+        super().__init__(
+            controller,
+            StandWorlds(
+                current=controller.balance.with_world_axis(),
+                speed_unit=body.speed_unit,
+                time_unit=body.time_unit,
+                height=np.array([crouch * controller.standing_height]),
+                offset=np.zeros((1, 3)),
+                offset_velocity=np.zeros((1, 3)),
+                offset_acceleration=np.zeros((1, 3)),
+                turn=np.zeros((1, 3)),
+                slow_since=np.array([np.nan]),
+                rests=np.array([at_rest]),
+                began=np.array([np.nan]),
+                time=np.array([np.nan]),
+            ),
+        )
+
+    def set_posture(self, posture: PostureTarget | None) -> None:
+        """Set the posture of the following time steps; None is the upright posture."""
+        worlds, row = self._worlds, self._row
+        posture = posture or PostureTarget(*np.zeros((4, 3)))
+        worlds.offset[row], worlds.offset_velocity[row] = posture.offset, posture.velocity
+        worlds.offset_acceleration[row], worlds.turn[row] = posture.acceleration, posture.turn
 
     @property
     def is_at_rest(self) -> bool:
         """True if the body is at rest."""
-        return self._is_resting
+        return bool(self._worlds.rests[self._row])
+
+    @property
+    def elapsed(self) -> float:
+        """Time in seconds from the first to the last time step; NaN before the first."""
+        return float(self._worlds.time[self._row] - self._worlds.began[self._row])
 
     def notes(self) -> list[str]:
         """Return no messages: standing has no target."""
         return []
-
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
-        measurement = self.controller.measure(state, report)
-        slow = bool(np.linalg.norm(measurement.velocity) <= REST_SPEED * np.sqrt(self._gravity * self.body.height))
-        self._is_resting = self._rest_detector.update(measurement.velocity, state.time) or (self._is_resting and slow)
-        rate = _RATE / self._time_unit
-        goal, posture = np.array([*(measurement.foot_centre - self.controller.base_offset), self._height]), self.posture
-        if posture is not None:
-            goal += posture.offset
-        acceleration = rate**2 * (goal - measurement.com) - 2.0 * rate * measurement.velocity
-        acceleration[:2] = self.controller.capture_acceleration(measurement, goal[:2])
-        if posture is not None:
-            # Feed-forward terms: the errors of both control laws are relative to the moving goal.
-            rates = np.array([*np.full(2, np.sqrt(self._gravity / self.controller.standing_height)), rate])
-            acceleration += posture.acceleration + 2.0 * rates * posture.velocity
-        acceleration[2] = max(acceleration[2], -0.8 * self._gravity)
-        velocity = measurement.velocity + dt * acceleration
-        heading = self.controller.sole_heading(state.positions)
-        pose = self.controller.over_base(measurement.com + dt * velocity, measurement.foot_centre, heading)
-        if posture is not None:
-            axes = self.controller.ground.axes
-            pose = axes.T @ Rotation.from_rotvec(posture.turn).as_matrix() @ axes @ pose
-        upright = self.controller.turn_towards(measurement, pose) * 4.0 / self._time_unit
-        velocity, spin = self.controller.balance_targets(measurement, velocity, upright, dt)
-        return self.controller.objectives(
-            state,
-            measurement,
-            com_velocity=velocity,
-            pose=pose,
-            pose_rate=np.zeros((3, 3)),
-            spin=spin,
-            follow=6.0 / self._time_unit,
-            weights=Weights(),
-        )
 
 
 class StandFor:
     """Stand for ``seconds`` s, and then until the body is at rest."""
 
     def __init__(self, stance: Stance, seconds: float) -> None:
-        self.seconds, self._stand, self._stance = seconds, Stand(stance), stance
-        self._started: float | None = None
-        self._is_over = False
+        self.seconds, self.stand, self._stance = seconds, Stand(stance), stance
 
     @property
     def is_at_rest(self) -> bool:
         """True if the time has passed and the body is at rest."""
-        return self._is_over and self._stand.is_at_rest
+        return self.stand.elapsed >= self.seconds - 1e-9 and self.stand.is_at_rest
 
     @property
     def expected_time(self) -> float:
@@ -164,6 +218,4 @@ class StandFor:
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
         the previous step."""
-        self._started = state.time if self._started is None else self._started
-        self._is_over = state.time - self._started >= self.seconds - 1e-9
-        return self._stand.objectives(state, report, dt)
+        return self.stand.objectives(state, report, dt)

@@ -20,6 +20,9 @@ from egs_warp.locomotion.rollout import RunSteps, StepRequest, solver_steps
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.strategies import Strategy
+from egs_warp.motions.current_motion import joined_motion
+from egs_warp.motions.fall_monitor import FallMonitor
+from egs_warp.motions.joined_motion import JoinedMotion
 from egs_warp.pipelines.captured_body import checked_friction
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.job import Job, RunSummary
@@ -189,6 +192,7 @@ def _run(creature: Creature, batch: Sequence[_BatchJob], progress: Progress) -> 
     done: dict[int, list[StepReport]] = {}
     running = list(range(len(runs)))
     while running:
+        _prepare_motions([runs[world] for world in running], [done.get(world, []) for world in running])
         results = [(world, *_resumed(runs[world], done.get(world))) for world in running]
         if frames:
             progress(dict(frames))
@@ -199,6 +203,22 @@ def _run(creature: Creature, batch: Sequence[_BatchJob], progress: Progress) -> 
         running = [world for world, kind, value in results if kind == "done" and value is None]
         done = {world: [] for world in running}
         state = _advanced(stepper, state, {world: runs[world] for world in running}, done)
+
+
+def _prepare_motions(runs: Sequence[_Run], done: Sequence[list[StepReport]]) -> None:
+    """Compute the next objectives of the motions that have a world axis; ``done`` are the reports of the steps of each
+    run. The runs then ask their motions for these objectives."""
+    groups: dict[tuple[type, int], list[tuple[JoinedMotion[Any], StepReport]]] = {}
+    dt = 0.0
+    for run, reports in zip(runs, done, strict=True):
+        if not reports or run.request is None or not isinstance(run.request.motion, FallMonitor):
+            continue
+        motion, dt = joined_motion(run.request.motion.sequence), run.request.dt
+        if motion is not None and run.one.is_planned:
+            groups.setdefault((type(motion), len(motion.reference.shares)), []).append((motion, reports[-1]))
+    for (kind, _), members in groups.items():
+        reports = [report for _, report in members]
+        kind.prepare([motion for motion, _ in members], [report.state for report in reports], reports, dt)
 
 
 def _start_runs(

@@ -27,9 +27,7 @@ from egs_warp.locomotion.objectives import (
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
-from egs_warp.motions.script import motion
-from egs_warp.motions.sequence import MotionSequence
-from egs_warp.pipelines.creature import Creature, initial_stance
+from egs_warp.pipelines.creature import Creature
 from tests.support.creatures import coarse_pawn, on_its_rim
 
 FRICTIONS = (0.8, 0.4, 0.6)
@@ -212,19 +210,3 @@ def test_unconverged_steps_are_halved_as_in_single_runs(creature: Creature, monk
     goals = [rising(creature, speed) for speed in (2.0, 0.0, 1.0)]
     made = check_runs(creature, lambda: goals, steps=1, dt=dt, starts=[starts[0], creature.start, starts[1]])
     assert len(made[0][0]) > 1 and len(made[1][0]) == 1
-
-
-@pytest.mark.slow
-def test_jumps_over_different_distances_equal_single_runs(creature: Creature) -> None:
-    """The motions compute the objectives of 30 steps from the states of their worlds, in a closed loop."""
-
-    def jumps() -> list[Goals]:
-        place = initial_stance(creature)
-        scripts = [motion(f"jump {distance}") for distance in (0.2, 0.5, 0.7)]
-        for script in scripts:
-            script.check(place)
-        return [MotionSequence(place, script.parts(creature.body.height)).objectives for script in scripts]
-
-    made = check_runs(creature, jumps, steps=30)
-    ends = [run[-1][-1].state.positions for run in made]
-    assert np.abs(ends[0] - ends[2]).max() > 1e-3 * creature.body.height

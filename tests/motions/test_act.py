@@ -86,13 +86,17 @@ def test_the_rotation_of_a_part_is_no_error_of_the_body(person: Stance) -> None:
     act.objectives(state, None, DT)
     stand = act._stand
     assert stand is not None
-    turn = stand.controller.gesture_turn
+    turn = stand.gesture_turn
     assert turn[1] > np.radians(0.5) and np.allclose(turn[[0, 2]], 0.0, atol=1e-3)
     layer = act._layers[0]
     nodes = person.ground.world(layer.pose(time + DT, person.ground.local(person.standing)))
-    apart = Rotation.from_matrix(stand.controller.measure(BodyState(nodes, 0 * nodes), None).rotation).magnitude()
-    stand.controller.gesture_turn = np.zeros(3)
-    tilted = Rotation.from_matrix(stand.controller.measure(BodyState(nodes, 0 * nodes), None).rotation).magnitude()
+    controller = stand.reference
+
+    def tilt(excluded: np.ndarray) -> float:
+        controller.gesture_turn = excluded
+        return Rotation.from_matrix(controller.measure(BodyState(nodes, 0 * nodes), None).rotation).magnitude()
+
+    apart, tilted = tilt(turn), tilt(np.zeros(3))
     assert apart < 0.1 * tilted
 
 

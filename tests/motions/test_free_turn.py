@@ -41,7 +41,9 @@ def test_a_tilted_body_reaches_the_requested_rotation(turn: float) -> None:
     goal = Rotation.from_rotvec(asked) * Rotation.from_rotvec(upright)
 
     def missed(spin: np.ndarray) -> float:
-        return float(np.degrees((goal * Rotation.from_matrix(integrate_rotation(inertia, spin, 1.2)).inv()).magnitude()))
+        return float(
+            np.degrees((goal * Rotation.from_matrix(integrate_rotation(inertia, spin, 1.2)).inv()).magnitude())
+        )
 
     assert missed((upright + asked) / 1.2) > 0.5
     assert missed(spin_for_rotation(inertia, upright, asked, 1.2)) < 0.02

@@ -68,7 +68,9 @@ def test_motions_jump_onto_the_solid_ahead(place: Stance, name: str) -> None:
     step = Solid((Plane(np.array([0.0, 0.0, 1.0]), -0.1), Plane(np.array([-1.0, 0.0, 0.0]), 0.3)))
     ground = Solid((Plane(np.array([0.0, 0.0, 1.0]), 0.0),))
     target, stepped = JumpTarget(0.5, 0.2), replace(place, solids=(ground, step))
-    begun = motion("jump 0.5 0.2").parts(1.0)[0].begin(stepped) if name == "jump" else Turn(stepped, target, 0.5).jumps[0]
+    begun = (
+        motion("jump 0.5 0.2").parts(1.0)[0].begin(stepped) if name == "jump" else Turn(stepped, target, 0.5).jumps[0]
+    )
     assert isinstance(begun, Jump) and begun.target.rise == pytest.approx(0.1)
 
 

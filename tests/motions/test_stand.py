@@ -20,7 +20,7 @@ def place() -> Stance:
 def objectives(place: Stance, posture: PostureTarget | None) -> tuple[np.ndarray, np.ndarray]:
     """Return the target velocity (3,) of the centre of mass and the target angular momentum (3,) of a body at rest."""
     stand = Stand(place)
-    stand.posture = posture
+    stand.set_posture(posture)
     rules = stand.objectives(BodyState(place.standing, 0 * place.standing), None, DT)
     (spin,) = [rule.target for rule in rules if isinstance(rule, AngularMomentumObjective)]
     (moving,) = [rule.target for rule in rules if isinstance(rule, Objective) and len(rule.target) == 3]

@@ -33,9 +33,7 @@ def test_a_turn_that_falls_short_is_completed_at_its_start(place: Stance) -> Non
     turn.objectives(state, None, DT)
     assert len(turn.jumps) == 2
     second = turn.jumps[1]
-    assert np.degrees(second.target_heading) == pytest.approx(25.0) and second.target.distance == pytest.approx(
-        0.1
-    )
+    assert np.degrees(second.target_heading) == pytest.approx(25.0) and second.target.distance == pytest.approx(0.1)
     assert np.allclose(second.ground.axes[0], [-1.0, 0.0, 0.0])
     assert turn.notes() == ["turned in 2 jumps"] and turn.plan_record().jumps == 2.0
     there = moved(place, np.radians(55.0), np.zeros(3))

@@ -104,14 +104,22 @@ def hull_kernel(
                 if step == count:
                     start = corners
             point = points[world, order[world, at]]
-            closed = corners > start and doubled_area(
-                corners_out[world, wp.max(corners - 2, 0)], corners_out[world, wp.max(corners - 1, 0)], point
-            ) <= tolerance
+            closed = (
+                corners > start
+                and doubled_area(
+                    corners_out[world, wp.max(corners - 2, 0)], corners_out[world, wp.max(corners - 1, 0)], point
+                )
+                <= tolerance
+            )
             while closed:
                 corners -= 1
-                closed = corners > start and doubled_area(
-                    corners_out[world, wp.max(corners - 2, 0)], corners_out[world, wp.max(corners - 1, 0)], point
-                ) <= tolerance
+                closed = (
+                    corners > start
+                    and doubled_area(
+                        corners_out[world, wp.max(corners - 2, 0)], corners_out[world, wp.max(corners - 1, 0)], point
+                    )
+                    <= tolerance
+                )
             if step < 2 * count - 2:
                 corners_out[world, corners] = point
                 corners += 1
