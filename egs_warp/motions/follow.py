@@ -25,11 +25,11 @@ from egs_warp.locomotion.objectives import (
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.balance import Weights
 from egs_warp.motions.body_parts import find_shape_parts
 from egs_warp.motions.feet import order_counterclockwise
 from egs_warp.motions.keyframes import Channel, Key, Quantity, channels
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.balance import Weights
 from egs_warp.motions.stance import BalanceController, RestDetector
 
 MISS_TOLERANCE = 0.1

@@ -16,8 +16,8 @@ from egs_warp.locomotion.reduced_objectives import AffineObjectives, ReducedObje
 from egs_warp.motions.airborne_soles import AirborneSoles
 from egs_warp.motions.balance import Balance, Measurement, Weights, solved
 from egs_warp.motions.free_turn import rotations_of
-from egs_warp.motions.jump_plan import SETTLE_TIME, JumpPhase, JumpPlan, stopping_time, sufficient_speed
 from egs_warp.motions.joined_motion import MotionWorlds
+from egs_warp.motions.jump_plan import SETTLE_TIME, JumpPhase, JumpPlan, stopping_time, sufficient_speed
 from egs_warp.motions.moments import ReducedState
 from egs_warp.motions.stance import update_rest
 from egs_warp.motions.support import nearest_in_half_planes

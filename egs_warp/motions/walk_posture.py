@@ -12,11 +12,11 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from egs_warp.motions.balance import SHEAR_BASIS
 from egs_warp.motions.feet import Foot, SupportKind, split_base
 from egs_warp.motions.gait import GaitTiming
 from egs_warp.motions.route import StepLimits
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.balance import SHEAR_BASIS
 
 MAX_STEP_PER_LEG = 0.5
 """Maximum step length relative to the length of the shortest leg."""
