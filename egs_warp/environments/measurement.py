@@ -9,7 +9,10 @@ import torch
 
 from egs_warp.fem.batched import BatchedRecord
 from egs_warp.fem.body import SoftBody
+from egs_warp.geometry.frames import nearest_rotation
 from egs_warp.locomotion.batch_state import BatchState
+from egs_warp.motions.balance import solved
+from egs_warp.motions.moments import part_moments
 
 
 @dataclass(frozen=True)
@@ -45,25 +48,17 @@ def measure(body: SoftBody, start: torch.Tensor, state: BatchState, means: torch
         state: state of B worlds.
         means: (M, m) 1/m, matrix that maps muscle activations to ``Measurement.activations``.
     """
-    mass = torch.as_tensor(body.node_mass, device=start.device)[:, None]
-    centre, start_centre = ((mass * each).sum(dim=-2) / body.mass for each in (state.positions, start))
-    arms, start_arms = state.positions - centre[:, None], start - start_centre
-    velocity = (mass * state.velocities).sum(dim=1) / body.mass
-    momentum = torch.linalg.cross(arms, mass * state.velocities).sum(dim=1)
-    second = arms.mT @ (mass * arms)
-    trace = second.diagonal(dim1=1, dim2=2).sum(dim=1)[:, None, None]
-    inertia = trace * torch.eye(3, dtype=trace.dtype, device=trace.device) - second
-    spin = torch.linalg.solve(inertia, momentum)
-    # The rotation R that minimises sum m |arm - R start arm|^2.
-    left, _, right = torch.linalg.svd(arms.mT @ (mass * start_arms))
-    handedness = torch.ones_like(centre)
-    handedness[:, 2] = torch.linalg.det(left @ right)
-    values = (
-        (centre - start_centre) / body.height,
-        velocity / body.speed_unit,
-        spin * body.time_unit,
-        left @ (handedness[:, :, None] * right),
-        state.forces[:, :, 0].sum(dim=1) / body.weight,
-        state.activations @ means,
+    shares = torch.as_tensor(body.node_mass / body.mass, device=start.device)[None]
+    start_centre = shares @ start
+    reference = (start - start_centre).expand_as(state.positions)
+    moments = part_moments(shares, reference, state.positions, state.velocities).on_host()
+    second = moments.second[:, 0]
+    inertia = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
+    return Measurement(
+        (moments.centres[:, 0] - start_centre.cpu().numpy()) / body.height,
+        moments.velocity / body.speed_unit,
+        solved(inertia, moments.spin) * body.time_unit,
+        nearest_rotation(moments.cross[:, 0]),
+        state.forces[:, :, 0].sum(dim=1).cpu().numpy() / body.weight,
+        (state.activations @ means).cpu().numpy(),
     )
-    return Measurement(*(each.cpu().numpy() for each in values))

@@ -34,7 +34,7 @@ class AffineObjectives(BatchedRecord):
     """(..., R) weights."""
 
     @classmethod
-    def joined(cls, parts: Sequence[AffineObjectives]) -> AffineObjectives:
+    def combined(cls, parts: Sequence[AffineObjectives]) -> AffineObjectives:
         """Return the objectives of all ``parts`` on the same worlds."""
         return cls(
             tuple(name for part in parts for name in part.names),

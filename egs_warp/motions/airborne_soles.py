@@ -78,7 +78,7 @@ class AirborneSoles(BatchedRecord):
             blocks.append(AffineObjectives(("sole velocity",) * 3, coefficients, targets, weights))
         if self.tilt_weight.any():
             blocks.append(self._tilt_objectives(balance, moments, pose, rate, share))
-        return AffineObjectives.joined(blocks)
+        return AffineObjectives.combined(blocks)
 
     def _tilt_objectives(
         self, balance: Balance, moments: PartMoments, pose: np.ndarray, rate: np.ndarray, share: np.ndarray

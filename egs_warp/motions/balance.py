@@ -324,7 +324,7 @@ class Balance(BatchedRecord):
         one = np.ones(com_velocity.shape[:-1])
         by_axis = np.stack([weights.com * one, weights.com * one, weights.up * one], axis=-1)
         return ReducedObjectives(
-            AffineObjectives.joined(
+            AffineObjectives.combined(
                 [
                     centre_of_mass_objectives(parts, self.axes, com_velocity, by_axis),
                     strain_objectives(parts, second, shape, weights.pose * one),

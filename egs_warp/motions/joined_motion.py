@@ -72,7 +72,7 @@ class JoinedMotion(Generic[WorldsT]):
 
         Args:
             motions: motions of one class, whose bodies have equally many parts.
-            states: the states from which they will be asked for objectives.
+            states: the states at the start of the step.
             reports: the reports of the previous steps.
             dt: size of the time step, s.
         """

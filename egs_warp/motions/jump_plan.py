@@ -207,8 +207,9 @@ def stopping_time(
 
 def _vector(forward: Any, up: Any) -> np.ndarray:
     """Return the vectors (..., 3) with these components (...,)."""
-    forward = np.asarray(forward)
-    return np.stack([forward, np.zeros_like(forward), np.broadcast_to(up, forward.shape)], axis=-1)
+    vectors = np.zeros((*np.shape(forward), 3))
+    vectors[..., 0], vectors[..., 2] = forward, up
+    return vectors
 
 
 def level_flight(jump_height: float, height: float, gravity: float) -> float:

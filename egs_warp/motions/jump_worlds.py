@@ -453,5 +453,5 @@ class JumpWorlds(MotionWorlds):
             approach[rows],
             share[rows],
         )
-        both = AffineObjectives.joined([objectives.affine, soles.expanded(rows, len(flies))])
+        both = AffineObjectives.combined([objectives.affine, soles.expanded(rows, len(flies))])
         return replace(objectives, affine=both)

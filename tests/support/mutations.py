@@ -250,21 +250,21 @@ OTHER_FORMULAS: list[Mutation] = [
         ),
         (
             *("a jump's plan: the load of a landing", "motions/jump_plan.py"),
-            *("(gravity + fall_speed / landing_time)", "(fall_speed / landing_time)"),
+            *("(gravity + fall_speed / duration)", "(fall_speed / duration)"),
             "motions/test_jump_plan.py::test_feet_stop_a_body_with_a_gradual_landing",
         ),
         (
-            *("balance: the centre of pressure under load", "motions/stance.py"),
-            *("height / up * (level + turn) / dt", "height / gravity * (level + turn) / dt"),
+            *("balance: the centre of pressure under load", "motions/balance.py"),
+            *("(height / up)[..., None] * (level + turn) / dt", "(height / gravity)[..., None] * (level + turn) / dt"),
             "motions/test_stance.py::test_balance_targets_are_the_nearest_that_do_not_tip",
         ),
         (
-            *("balance: the friction limit under load", "motions/stance.py"),
-            *("np.array([0.0, 0.0, up]), self._normal", "np.array([0.0, 0.0, gravity]), self._normal"),
+            *("balance: the friction limit under load", "motions/balance.py"),
+            *("load = up[..., None] * np", "load = gravity * np"),
             "motions/test_stance.py::test_requests_are_limited_by_friction",
         ),
         (
-            *("balance: the margin of the footprint", "motions/stance.py"),
+            *("balance: the margin of the footprint", "motions/balance.py"),
             *("measurement.support.scaled(SUPPORT_MARGIN)", "measurement.support"),
             "motions/test_stance.py::test_balance_targets_are_the_nearest_that_do_not_tip",
         ),
@@ -285,7 +285,7 @@ OTHER_FORMULAS: list[Mutation] = [
         ),
         (
             *("twist: the angular velocity of the standing body, not of the crouched one", "motions/twist.py"),
-            *("return inertia @ spin_for_rotation(", "return measurement.inertia @ spin_for_rotation("),
+            *("momenta[rows] = times(inertia, spin)", "momenta[rows] = times(measurement.inertia[rows], spin)"),
             "motions/test_twist.py::test_a_twist_requests_the_remaining_spin_from_friction",
         ),
         (
@@ -295,7 +295,7 @@ OTHER_FORMULAS: list[Mutation] = [
         ),
         (
             *("twist: a free body conserves its angular momentum, not its angular velocity", "motions/free_turn.py"),
-            *("axes @ np.linalg.solve(inertia, axes.T @ momentum)", "np.linalg.solve(inertia, momentum)"),
+            *("times(axes @ inverse, times(axes.swapaxes(-1, -2), momentum))", "times(inverse, momentum)"),
             "motions/test_free_turn.py::test_a_symmetric_top_precesses_about_its_angular_momentum",
         ),
         (
