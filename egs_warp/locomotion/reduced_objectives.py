@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.fem.batched import Array, BatchedRecord, contiguous, empty_like, launch_on
+from egs_warp.fem.batched import ArrayT, BatchedRecord, contiguous, empty_like, launch_on
 from egs_warp.kernels.locomotion.objective_rows import affine_rows_kernel
 from egs_warp.locomotion.objectives import AngularMomentumObjective, AnyObjective, Objective, strain_modes
 from egs_warp.precision import Vec3, real
@@ -56,7 +56,7 @@ class AffineObjectives(BatchedRecord):
 
         return replace(self, **{name: spread(value) for name, value in self.batched_fields()})
 
-    def rows(self, shares: Array, centre: Array, positions: Array, scales: Array) -> Array:
+    def rows(self, shares: ArrayT, centre: ArrayT, positions: ArrayT, scales: ArrayT) -> ArrayT:
         """Return the rows (B, R, 3N) of B worlds, on the device of the arguments.
 
         Args:

@@ -180,7 +180,7 @@ class Follow:
         balance = np.array([*(measurement.foot_centre - self.controller.base_offset), self.controller.standing_height])
         rules: list[AnyObjective] = []
         velocity = self._rate / 3.0 * (balance - measurement.com)
-        pose = self.controller.over_base(measurement.com, measurement.foot_centre, measurement.heading)
+        pose = self.controller.over_base(measurement.com, measurement.foot_centre, float(measurement.heading))
         upright = self.controller.turn_towards(measurement, pose) * 0.7 * self._rate
         velocity, spin = self.controller.balance_targets(measurement, velocity, upright, dt)
         if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & ruled:

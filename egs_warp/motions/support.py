@@ -176,8 +176,8 @@ _MAX_WORKSPACES = 8
 
 
 def _hull_workspace(worlds: int, points: int) -> _HullWorkspace:
-    """Return a workspace for the hulls of at most ``points`` points in each of the ``worlds``. A launch from memory that
-    Warp knows takes a third of the time of one from new arrays."""
+    """Return a workspace for the hulls of at most ``points`` points in each of the ``worlds``. A launch from the same
+    memory as before takes a third of the time of one from new arrays."""
     key = worlds, round_up(points, 16)
     space = _workspaces.by_size.pop(key, None) or _HullWorkspace(*key)
     _workspaces.by_size[key] = space
