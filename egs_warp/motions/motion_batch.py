@@ -145,8 +145,8 @@ class MotionBatch:
                 each = [self._objectives_of(world, state, dt) for world in self._others]
                 rows = self._rows_of(self._others)
                 parts.append((rows, BatchObjectives.stack(each, state.positions.shape[1], self._device)))
-                # A motion may have started; the next step forms new groups.
-                self._groups = None
+                if any(joined_motion(self._motions[world]) is not None for world in self._others):
+                    self._groups = None
             return BatchObjectives.merged(parts, len(state.worlds))
 
     def finish_step(self, steps: Sequence[BatchStep]) -> None:

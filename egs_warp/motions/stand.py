@@ -153,6 +153,11 @@ class Stand(JoinedMotion[StandWorlds]):
             ),
         )
 
+    @property
+    def controller(self) -> BalanceController:
+        """Balance controller of the body."""
+        return self.reference
+
     def set_posture(self, posture: PostureTarget | None) -> None:
         """Set the posture of the following time steps; None is the upright posture."""
         worlds, row = self._worlds, self._row

@@ -90,7 +90,7 @@ def test_the_rotation_of_a_part_is_no_error_of_the_body(person: Stance) -> None:
     assert turn[1] > np.radians(0.5) and np.allclose(turn[[0, 2]], 0.0, atol=1e-3)
     layer = act._layers[0]
     nodes = person.ground.world(layer.pose(time + DT, person.ground.local(person.standing)))
-    controller = stand.reference
+    controller = stand.controller
 
     def tilt(excluded: np.ndarray) -> float:
         controller.gesture_turn = excluded
