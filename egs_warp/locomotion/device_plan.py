@@ -27,17 +27,16 @@ from egs_warp.fem.tiled_cholesky import TiledCholesky
 from egs_warp.kernels.locomotion import step_program as kernels
 from egs_warp.kernels.locomotion.active_set import OPTIMUM_FOUND
 from egs_warp.kernels.locomotion.mode_search import HEADER_SIZE
-from egs_warp.kernels.locomotion.relaxed_contact import pack_search_kernel
-from egs_warp.locomotion.contact_modes import ModeSearchResult, search_modes, solve_relaxed
+from egs_warp.locomotion.contact_modes import ModeSearchResult
 from egs_warp.locomotion.device_linear_step import DeviceLinearSteps, StagingBuffer, objective_form
-from egs_warp.locomotion.device_search import ModeSearchWorkspace, RelaxationWorkspace
+from egs_warp.locomotion.device_restart import DeviceRestart
+from egs_warp.locomotion.device_search import ModeSearchWorkspace
 from egs_warp.locomotion.linear_step import PREDICTION_ITERATIONS, PredictedStep, StepInputs, torques_of
 from egs_warp.locomotion.objectives import AnyObjective, Objective
 from egs_warp.locomotion.planner import REGULARIZATION, Plan, StepPlanner
-from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.step_cost import EFFORT_HORIZON
 from egs_warp.locomotion.step_tensors import add_activation_cost, add_effort
-from egs_warp.locomotion.strategies import RESTART_COST, needs_restart, restart_from_relaxation
+from egs_warp.locomotion.strategies import RESTART_COST, needs_restart
 from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.precision import Vec3, real
 
@@ -180,11 +179,11 @@ class PlanWorkspace:
         self._x, self._uploaded_point = zeros(m + width + 1), PinnedUpload(body.stream, m + width + 1)
         alias = str(body.factors.device)
         self._search = ModeSearchWorkspace(m, capacity, alias, restart_cost=RESTART_COST)
-        self._relaxed = RelaxationWorkspace(m, capacity, self._search)
-        self._second = ModeSearchWorkspace(m, capacity, alias, first_search=self._search)
+        limit = owner.planner.settings.qp_limit
+        self._restart = DeviceRestart(
+            body, newton, self._search, self._contact_velocities, self._predicted_forces, qp_limit=limit
+        )
         self._objective, self._is_restart_parallel = 0.0, False
-        # Contact forces at the start of the second search, and their violation of Coulomb's law, which is not checked.
-        self._restart_forces, self._restart_violation = zeros(width), zeros(1)
         # 1 if the solve starts from the end of the first search.
         self._starts_solve = torch.zeros(1, dtype=torch.int32, device=body.factors.device)
         self._graphs, self._plan_event = GraphCache(body.stream), None
@@ -273,8 +272,8 @@ class PlanWorkspace:
             x = search_result[HEADER_SIZE : HEADER_SIZE + self.m + 3 * contacts].copy() if has_point == 1.0 else None
             first = ModeSearchResult(x, objective, int(count), int(infeasible))
             if status != OPTIMUM_FOUND:
-                first = self._search_on_host(self._search)
-            final = self._search_with_restart(first, contacts)
+                first = self._restart.search_on_host(self._search)
+            final = self._restart.improve(first, contacts, self._run, is_done=self._is_restart_parallel)
             if final.x is None:
                 return None
             count, infeasible = final.qp_count, final.infeasible
@@ -294,65 +293,6 @@ class PlanWorkspace:
         end = response.iterate(tension, forces, float(residual_norm), contact_velocities, velocities, None)
         newton.base_iterate, newton.trial_iterate, newton.pending_iterate = None, None, end
         return Plan(activations, end.velocities, end.forces, int(count), int(infeasible))
-
-    def _search_with_restart(self, result: ModeSearchResult, contacts: int) -> ModeSearchResult:
-        """Return ``result``; if its objective is high, run a restart and return the better of both results."""
-        if not needs_restart(result.objective, contacts):
-            return result
-        relaxed_on_device = self._relaxed.parse_result() if self._is_restart_parallel else None
-        if relaxed_on_device is None:
-            with self.body.stream:
-                self._search.is_accepted.zero_()
-                self._run(self._enqueue_restart)
-            relaxed_on_device = self._relaxed.parse_result()
-        relaxed = relaxed_on_device or solve_relaxed(self._search.parse_input()[0], QpSolver.OSQP)
-
-        def search(activations: np.ndarray) -> ModeSearchResult:
-            if relaxed_on_device is None:
-                with self.body.stream:
-                    self._uploaded_point.set(activations)
-                    self._run(self._enqueue_from_point)
-            return self._second.parse_result(self.m + 3 * contacts) or self._search_on_host(self._second)
-
-        return restart_from_relaxation(result, relaxed, search)
-
-    def _search_on_host(self, search: ModeSearchWorkspace) -> ModeSearchResult:
-        """Repeat the search in the workspace ``search`` on the host, after a numerical failure of the kernel."""
-        program, start, modes = search.parse_input()
-        limit = self.owner.planner.settings.qp_limit
-        return search_modes(program, start, modes, qp_limit=limit, solver=QpSolver.OSQP)
-
-    def _enqueue_restart(self) -> None:
-        """Queue the solve for the relaxed optimum, and a search that starts from it."""
-        # Make Warp launch on PyTorch's current stream.
-        with wp.ScopedStream(self.body.stream.current(), sync_enter=False):
-            self._relaxed.enqueue()
-            self._enqueue_from(wp.to_torch(self._relaxed.packed_result)[HEADER_SIZE:])
-
-    def _enqueue_from_point(self) -> None:
-        """Queue the second search from the activations that were uploaded."""
-        self._enqueue_from(self._uploaded_point.device[: self.m])
-
-    def _enqueue_from(self, activations: torch.Tensor) -> None:
-        """Queue the second search, from ``activations`` (m,) and the contact forces that they cause."""
-        body, newton = self.body, self.newton
-        contact_free = torch.addmv(self._contact_velocities[:, -1], self._contact_velocities[:, : self.m], activations)
-        self._restart_forces.copy_(self._predicted_forces)
-        newton.coulomb.enqueue_forces(contact_free, self._restart_forces, self._restart_violation)
-        wp.to_torch(self._second.packed_qp).copy_(wp.to_torch(self._search.packed_qp))
-        wp.launch(
-            pack_search_kernel,
-            (1, self.m + newton.capacity),
-            inputs=[
-                body.body.weight,
-                as_warp(activations[None], real),
-                as_warp(self._restart_forces.view(1, -1, 3), Vec3),
-                self._search.is_accepted,
-            ],
-            outputs=[as_world(self._second.packed_qp)],
-            device=body.body.assembly.device,
-        )
-        self._second.enqueue()
 
     def _replace_end(self, x: np.ndarray, start: StepInputs) -> None:
         """Replace the expected end of the step by the end for ``x`` (m + 3n,), the result of another search, and start
@@ -495,7 +435,7 @@ class PlanWorkspace:
             device=target,
         )
         self._search.is_accepted.zero_()
-        body.stream.fork_join([self._search.enqueue, *([self._enqueue_restart] if is_parallel else [])])
+        body.stream.fork_join([self._search.enqueue, *([self._restart.enqueue_restart] if is_parallel else [])])
         wp.launch(
             kernels.scatter_solution_kernel,
             (1, len(self._x)),

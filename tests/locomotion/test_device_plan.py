@@ -16,10 +16,11 @@ from egs_warp.contact.device_newton import DeviceNewtonIterate
 from egs_warp.contact.device_newton_workspace import NewtonWorkspace
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion import device_plan, strategies
+from egs_warp.locomotion import device_plan, device_restart, strategies
 from egs_warp.locomotion import stepper as stepping
 from egs_warp.locomotion.contact_modes import search_modes, solve_relaxed
 from egs_warp.locomotion.device_plan import DevicePlanner, PlanWorkspace
+from egs_warp.locomotion.device_restart import DeviceRestart
 from egs_warp.locomotion.device_search import ModeSearchWorkspace, RelaxationWorkspace
 from egs_warp.locomotion.linear_step import PredictedStep, StepInputs
 from egs_warp.locomotion.objectives import (
@@ -212,16 +213,16 @@ def test_a_restart_equals_that_of_the_host(
     def noted(module: Any, name: str, given: Callable[..., Any]) -> None:
         monkeypatch.setattr(module, name, wraps(given)(lambda *a, **b: asked.append(name) or given(*a, **b)))
 
-    noted(device_plan, "search_modes", search_modes)
-    noted(device_plan, "solve_relaxed", solve_relaxed)
-    noted(PlanWorkspace, "_enqueue_restart", PlanWorkspace._enqueue_restart)
-    noted(PlanWorkspace, "_enqueue_from_point", PlanWorkspace._enqueue_from_point)
+    noted(device_restart, "search_modes", search_modes)
+    noted(device_restart, "solve_relaxed", solve_relaxed)
+    noted(DeviceRestart, "enqueue_restart", DeviceRestart.enqueue_restart)
+    noted(DeviceRestart, "enqueue_from_point", DeviceRestart.enqueue_from_point)
     noted(PlanWorkspace, "_replace_end", PlanWorkspace._replace_end)
     if what != "astray":
         monkeypatch.setattr(strategies, "RESTART_COST", 0.0)
         monkeypatch.setattr(strategies, "RESTART_GAP", 0.0)
     if what not in ("costly", "astray"):
-        for module in (strategies, device_plan):
+        for module in (strategies, device_restart):
             monkeypatch.setattr(
                 module,
                 "restart_from_relaxation",
@@ -236,14 +237,14 @@ def test_a_restart_equals_that_of_the_host(
         monkeypatch.setattr(ModeSearchWorkspace, "parse_result", lambda *_: None)
     assert equals_host_plan(stepper, start, memory, objectives)
     expected = {
-        "costly": ["_enqueue_restart", "_replace_end"],
-        "better": ["_enqueue_restart", "_replace_end"],
-        "kept": ["_enqueue_restart"],
+        "costly": ["enqueue_restart", "_replace_end"],
+        "better": ["enqueue_restart", "_replace_end"],
+        "kept": ["enqueue_restart"],
         "astray": ["search_modes", "_replace_end"],
-        "no bound": ["_enqueue_restart", "solve_relaxed", "_enqueue_from_point", "_replace_end"],
-        "second astray": ["_enqueue_restart", "search_modes", "_replace_end"],
+        "no bound": ["enqueue_restart", "solve_relaxed", "enqueue_from_point", "_replace_end"],
+        "second astray": ["enqueue_restart", "search_modes", "_replace_end"],
     }
-    again = ["_enqueue_restart"] if beside and what in ("astray", "no bound") else []
+    again = ["enqueue_restart"] if beside and what in ("astray", "no bound") else []
     assert asked == again + expected[what]
     found = planner_of(stepper).plan(start, objectives)
     assert found is not None
