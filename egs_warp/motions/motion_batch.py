@@ -22,6 +22,7 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.reduced_objectives import ReducedObjectives
 from egs_warp.locomotion.step_tensors import WeightedRows
 from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.motions.current_motion import joined_motion
 from egs_warp.motions.joined_motion import JoinedMotion, MotionWorlds
 from egs_warp.motions.moments import ReducedState, contact_positions, part_moments
@@ -75,7 +76,9 @@ class _Group:
             load=contacts.load,
             gap=contacts.gap,
         )
-        objectives = self.motions.step(reduced.on_host(), dt)
+        on_host = reduced.on_host()
+        with one_blas_thread():
+            objectives = self.motions.step(on_host, dt)
         return self._on_device(objectives, moments.centres[:, 0], positions)
 
     def _on_device(

@@ -20,6 +20,7 @@ from egs_warp.locomotion.rollout import RunSteps, StepRequest, solver_steps
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.strategies import Strategy
+from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.motions.current_motion import joined_motion
 from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.joined_motion import JoinedMotion
@@ -218,7 +219,8 @@ def _prepare_motions(runs: Sequence[_Run], done: Sequence[list[StepReport]]) -> 
             groups.setdefault((type(motion), len(motion.reference.shares)), []).append((motion, reports[-1]))
     for (kind, _), members in groups.items():
         reports = [report for _, report in members]
-        kind.prepare([motion for motion, _ in members], [report.state for report in reports], reports, dt)
+        with one_blas_thread():
+            kind.prepare([motion for motion, _ in members], [report.state for report in reports], reports, dt)
 
 
 def _start_runs(
