@@ -197,7 +197,8 @@ def stopping_time(
     After T, the capture point must be at the feet: -y' = sqrt(g / h) y. For T = 0, the landing impulse reduces the
     forward speed by s y / h at once.
     """
-    swaying, is_gradual = np.sqrt(gravity / com_height), np.asarray(landing_time) > 0.0
+    swaying = np.sqrt(gravity / com_height)
+    is_gradual = np.asarray(landing_time) > 0.0
     duration = np.where(is_gradual, landing_time, 1.0)
     loaded_rate = np.sqrt((gravity + fall_speed / duration) / com_height)
     even, odd = np.cosh(loaded_rate * duration), np.sinh(loaded_rate * duration)

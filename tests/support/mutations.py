@@ -300,7 +300,7 @@ OTHER_FORMULAS: list[Mutation] = [
         ),
         (
             *("twist: arms as the square root of the inertia", "motions/twist.py"),
-            *("width = float(np.sqrt(np.clip(", "width = float((np.clip("),
+            *("width = np.where(self.turns, np.sqrt(np.clip(", "width = np.where(self.turns, (np.clip("),
             "motions/test_twist.py::test_in_the_air_the_width_is_adjusted_to_the_turn",
         ),
         (
