@@ -12,6 +12,7 @@ from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.world_audit import audit_world
 from egs_warp.motions.stance import REST_SPEED
 from egs_warp.pipelines import render_data
+from egs_warp.pipelines.finished_world import SHAPE
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run, write_report
 from egs_warp.pipelines.shot import Shot, resized
@@ -20,8 +21,6 @@ from egs_warp.pipelines.world_film import FilmedWorld, draw_world_film, world_ca
 from egs_warp.pipelines.world_report import WorldReport
 from egs_warp.pipelines.world_run import WorldRun
 
-SHAPE = "contact_shape.npz"
-"""Name of the file with the contact points and the level set of a body, in the folder of the body."""
 COMMAND = "animate world"
 """Command in the manifest of a run folder; such a run cannot be resumed."""
 
