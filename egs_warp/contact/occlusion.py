@@ -17,11 +17,11 @@ from egs_warp.launching import launch_rows
 from egs_warp.meshing.level_set import LevelSet
 from egs_warp.short_repr import short_repr
 
-_MAX_OPACITY = 0.6
+_MAX_OPACITY = 0.85
 """Opacity of the shadow of a touching surface that hides the whole sky."""
-_REACH = 0.035
+_REACH = 0.06
 """Gap at which a shadow has 1/e of its opacity, in heights of the occluding body."""
-_CUTOFF = 4.0
+_CUTOFF = 3.5
 """Gap beyond which there is no shadow, in units of ``_REACH``."""
 
 

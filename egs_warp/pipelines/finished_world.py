@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 
 from egs_warp.contact.terrain import Solid
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -141,6 +141,11 @@ def read_finished(folder: Path, *, background: Path | None = None) -> FinishedRu
     """Read the finished run of a single capture or of a world. Raises ``UserError`` for any other folder."""
     if not is_world_folder(folder):
         return FinishedRun.read(folder, background=background)
-    if background is not None:
-        raise UserError("background: a run of a world has no capture behind its bodies; leave it out")
+    check_no_background(background)
     return FinishedWorld.read(folder)
+
+
+def check_no_background(background: Path | None) -> None:
+    """Raise ``ArgumentError`` if a background is given for the run of a world."""
+    if background is not None:
+        raise ArgumentError("background", "a run of a world has no capture behind its bodies", value=background)
