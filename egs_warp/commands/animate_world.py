@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from egs_warp.commands.camera_flags import shot_of
@@ -24,6 +25,14 @@ def is_world(capture: str) -> bool:
     return Path(capture).suffix.lower() in WORLD_ENDINGS
 
 
+def check_flags(args: argparse.Namespace, allowed: Sequence[str]) -> None:
+    """Raise ``UserError`` for a flag of the command that is not ``allowed`` for a world."""
+    for action in args.parser._actions:
+        if action.dest in vars(args) and action.dest not in allowed and getattr(args, action.dest) != action.default:
+            flag = action.option_strings[0] if action.option_strings else action.dest
+            raise UserError(f"{flag}: is for a single capture; a world file describes its bodies; leave it out")
+
+
 def animate_world(args: argparse.Namespace) -> bool:
     """Run ``egs-warp animate`` for a world file; return True if the exit status must report a failure. The caller has
     checked the output folder."""
@@ -37,10 +46,7 @@ def animate_world(args: argparse.Namespace) -> bool:
     from egs_warp.pipelines.world_file import read_world
     from egs_warp.pipelines.world_run import simulate_world
 
-    for action in args.parser._actions:
-        if action.dest in vars(args) and action.dest not in _FLAGS and getattr(args, action.dest) != action.default:
-            flag = action.option_strings[0] if action.option_strings else action.dest
-            raise UserError(f"{flag}: is for a single capture; a world file describes its bodies; leave it out")
+    check_flags(args, _FLAGS)
     shot, background = shot_of(args)
     if background is not None:
         raise UserError("--background: a world has a colour or transparent as its background; give one of these")

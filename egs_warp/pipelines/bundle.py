@@ -15,6 +15,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import with_degree
 from egs_warp.geometry.main_light import normalised
+from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.bundle import Bundle, BundleBody, BundleCage, write_bundle
 from egs_warp.io.planes import light_to_json
 from egs_warp.io.run_folder import check_no_file_of_a_run
@@ -80,7 +81,7 @@ def bundle_of_world(
             run.steps[frames],
             degree,
             name=name,
-            cage=DrawnCage.of(run.trajectory, world.shapes[name]),
+            cage=DrawnCage.of(run.mesh, world.shapes[name]),
         )
         for name, run in world.bodies.items()
     )
@@ -143,7 +144,7 @@ def _moving_body(
     name: str = "creature",
     cage: DrawnCage | None = None,
 ) -> BundleBody:
-    drawn = cage or DrawnCage.of(t)
+    drawn = cage or DrawnCage.of(TetMesh(t.rest_positions, t.tets))
     bundled = BundleCage(
         rest_nodes=drawn.nodes.astype(np.float32),
         cage_tets=drawn.tets,

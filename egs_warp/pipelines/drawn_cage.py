@@ -13,7 +13,6 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.locomotion.world_audit import ContactShape
 from egs_warp.short_repr import short_repr
 
@@ -23,7 +22,7 @@ _CELLS = 12
 
 @dataclass(frozen=True)
 class DrawnCage:
-    """Cage of N nodes, of which the first C are those of the trajectory."""
+    """Cage of N nodes, of which the first C are those of the cage of the solver."""
 
     __repr__ = short_repr
 
@@ -37,27 +36,26 @@ class DrawnCage:
     """(N - C, 4) barycentric weights of the further nodes in the only tetrahedron; (0, 4) if there are none."""
 
     @classmethod
-    def of(cls, t: Trajectory, shape: ContactShape | None = None) -> DrawnCage:
-        """Return the drawn cage of a body. ``shape`` has the level set of a prop; without it, the surface is that of
-        the tetrahedra."""
-        if shape is None or len(t.tets) > 1:
-            mesh = TetMesh(t.rest_positions, t.tets)
+    def of(cls, mesh: TetMesh, shape: ContactShape | None = None) -> DrawnCage:
+        """Return the drawn cage of a body with the cage ``mesh`` at rest. ``shape`` has the level set of a prop; without
+        it, the surface is that of the tetrahedra."""
+        if shape is None or len(mesh.tets) > 1:
             return cls(mesh.nodes, mesh.tets, mesh.boundary_faces(), np.zeros((0, 4)))
-        vertices, faces = _surface(t, shape)
+        vertices, faces = _surface(mesh, shape)
         # A level set has the frame of ``rest_positions`` of the shape, which are the nodes of the cage at rest.
-        matrix = np.vstack([t.rest_positions[t.tets[0]].T, np.ones(4)])
+        matrix = np.vstack([mesh.nodes[mesh.tets[0]].T, np.ones(4)])
         weights = np.linalg.solve(matrix, np.vstack([vertices.T, np.ones(len(vertices))])).T
-        count = len(t.rest_positions)
-        return cls(np.concatenate([t.rest_positions, vertices]), t.tets, faces + count, weights)
+        count = len(mesh.nodes)
+        return cls(np.concatenate([mesh.nodes, vertices]), mesh.tets, faces + count, weights)
 
     def positions(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the positions (..., N, 3) m for those of the nodes of the trajectory, (..., C, 3) m."""
+        """Return the positions (..., N, 3) m for those of the nodes of the cage, (..., C, 3) m."""
         if len(self.weights) == 0:
             return nodes
         return np.concatenate([nodes, np.einsum("vw,...wi->...vi", self.weights, nodes[..., self.tets[0], :])], axis=-2)
 
 
-def _surface(t: Trajectory, shape: ContactShape) -> tuple[np.ndarray, np.ndarray]:
+def _surface(mesh: TetMesh, shape: ContactShape) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (V, 3) m and triangles (B, 3) of the zero set of the level set on a coarse lattice; those of the
     convex hull of the contact points if the body is too thin for the lattice."""
     from skimage import measure
@@ -70,7 +68,7 @@ def _surface(t: Trajectory, shape: ContactShape) -> tuple[np.ndarray, np.ndarray
     if values.min() < 0.0:
         vertices, faces, _, _ = measure.marching_cubes(values, 0.0)
         return shape.origin + step * vertices.astype(np.float64), faces.astype(np.int32)
-    points = shape.points(t.tets, t.rest_positions)
+    points = shape.points(mesh.tets, mesh.nodes)
     hull = ConvexHull(points)
     used, faces = np.unique(hull.simplices, return_inverse=True)
     vertices, faces = points[used], faces.reshape(-1, 3)

@@ -105,7 +105,7 @@ class _BodyPrims:
         Sdf, _, UsdGeom, UsdVol, Vt = _modules()
         self._run, self._degree, self._deformer = run, degree, run.deformer()
         t = run.trajectory
-        self._drawn = DrawnCage.of(t, shape)
+        self._drawn = DrawnCage.of(run.mesh, shape)
         UsdGeom.Xform.Define(stage, path)
         self._splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"{path}/{SPLATS}")
         _write_constant(self._splats, with_degree(run.creature.splats, degree), Vt)

@@ -29,6 +29,11 @@ from egs_warp.web.session import Session
 _HALF_VIEW_HEIGHT = 1.0
 """Half of the height that the initial camera shows, in body heights."""
 
+STYLES = {
+    name: {key: style[key] for key in STYLE_NAMES} for name, style in {"usual": vars(Style()), **PRESETS}.items()
+}
+"""Named styles of jumps, for the page."""
+
 
 class LiveFeed:
     """``FrameFeed`` of a live session."""
@@ -71,10 +76,7 @@ class LiveFeed:
             "motion": [],
             "notes": [],
             "limits": {"friction": [0.0, MAX_FRICTION], "sag": [MIN_SAG, MAX_SAG], "style": [MIN_FACTOR, MAX_FACTOR]},
-            "styles": {
-                name: {key: style[key] for key in STYLE_NAMES}
-                for name, style in {"usual": vars(Style()), **PRESETS}.items()
-            },
+            "styles": STYLES,
         }
         planes = np.array([[*plane.normal, plane.offset] for plane in creature.geometry.planes])
         deformer = Deformer(render_data.splats, embed_gaussians(render_data.splats, mesh))

@@ -34,7 +34,7 @@ class PageBody:
     cage: DrawnCage
     """Cage with the drawn surface."""
     node_mass: np.ndarray
-    """(C,) kg, masses of the nodes of the trajectory."""
+    """(C,) kg, masses of the nodes of the solver's cage."""
     deformer: Deformer
     facts: Mapping[str, Any]
     """Further facts for the page, such as the row of the report."""

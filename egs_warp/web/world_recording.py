@@ -29,7 +29,7 @@ class WorldRecording(FinishedWorld):
             PageBody(
                 name,
                 run.creature,
-                DrawnCage.of(run.trajectory, self.shapes[name]),
+                DrawnCage.of(run.mesh, self.shapes[name]),
                 run.trajectory.node_mass,
                 self.filmed.bodies[name].deformer,
                 {key: str(rows[name].get(key, "")) for key in ("state", "result", "audit")},

@@ -227,7 +227,7 @@ export class Live {
   /** Steer another creature of a world. */
   select(index: number): void {
     const part = this.viewer.parts?.[index];
-    if (part !== undefined) this.source.send({ type: "select", body: part.name });
+    if (part?.creature) this.source.send({ type: "select", body: part.name });
   }
 
   /** Push the creature that is steered; a click on another creature of a world selects it. */
@@ -236,7 +236,7 @@ export class Live {
     const index = this.viewer.bodyOf(node);
     const isOther = parts?.[index]?.creature === true && parts[index].name !== this.state?.body;
     if (isOther) this.select(index);
-    else this.pushTool.push(node);
+    else if (parts?.[index]?.creature !== false) this.pushTool.push(node);
   }
 
   private go(x: number, y: number): void {
