@@ -191,6 +191,7 @@ class Recorder:
             "contact_gap": np.concatenate([report.end_gaps for report in reports]),
             "contact_point": np.concatenate([report.contacts.points for report in reports]),
             "contact_load": np.concatenate([report.forces for report in reports]),
+            **(_frames(reports) if self._folder is not None else {}),
             "kick_step": np.array([step for step, _ in kicks], np.int32),
             "kick_velocity": np.array([kick for _, kick in kicks]).reshape(-1, *reports[0].state.positions.shape),
             "asked_step": np.array([step for step, _ in requests]),
@@ -200,6 +201,15 @@ class Recorder:
         }
         self._steps += len(reports)
         return part
+
+
+def _frames(reports: Sequence[StepReport]) -> dict[str, np.ndarray]:
+    """Return the frames (n, 3, 3) of all contacts, and their gaps (n,) at the starts of the steps, m. Only a continued
+    run reads them."""
+    return {
+        "contact_axes": np.concatenate([report.contacts.axes for report in reports]),
+        "contact_start_gap": np.concatenate([report.contacts.gaps for report in reports]),
+    }
 
 
 def _laps(reports: Sequence[StepReport]) -> dict[str, np.ndarray]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from egs_warp.io.run_folder import RunFolder, run_folder
+from egs_warp.io.run_folder import ANIMATE_WORLD, RunFolder, run_folder
 from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.world_audit import audit_world
 from egs_warp.motions.stance import REST_SPEED
 from egs_warp.pipelines import render_data
+from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.finished_world import SHAPE
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run, write_report
@@ -21,8 +23,6 @@ from egs_warp.pipelines.world_film import FilmedWorld, draw_world_film, world_ca
 from egs_warp.pipelines.world_report import WorldReport
 from egs_warp.pipelines.world_run import WorldRun
 
-COMMAND = "animate world"
-"""Command in the manifest of a run folder; such a run cannot be resumed."""
 
 
 def write_world(
@@ -59,7 +59,7 @@ def write_world(
     Raises:
         UserError: The folder cannot be written.
     """
-    with run_folder(out, command=COMMAND, overwrite=overwrite) as folder:
+    with run_folder(out, command=ANIMATE_WORLD, overwrite=overwrite) as folder:
         reports: dict[str, Report] = {}
         results: dict[str, str] = {}
         for name, result in run.bodies.items():
@@ -86,6 +86,8 @@ def write_world(
         video = draw_world_film(filmed, camera, folder, shot=shot, shadow=shadow, quiet=quiet) if film else None
         whole = WorldReport(reports, results, audit, run.stopped, video, tuple(notes), asked or {})
         write_report(folder.file("report.json"), whole.to_json())
+        for name in run.bodies:
+            shutil.rmtree(folder.path / name / PARTS, ignore_errors=True)
         if not isinstance(out, RunFolder):
             folder.finish()
     return whole

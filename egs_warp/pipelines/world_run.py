@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -12,9 +13,9 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
-from egs_warp.locomotion.rollout import FRAME_RATE, BodyRun, RolloutResult
+from egs_warp.locomotion.rollout import FRAME_RATE, BodyRun, RolloutOptions, RolloutResult
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.locomotion.trajectory import FIRST_PART, Trajectory
 from egs_warp.locomotion.world_rollout import roll_out_world, world_steps
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
@@ -24,6 +25,7 @@ from egs_warp.motions.style import Style
 from egs_warp.motions.towards import OtherBody, script_among
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.end_state import EndCause
+from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.prop import Prop
 from egs_warp.pipelines.simulated_run import BodyResult, Performer, SimulatedRun, check_frames
 from egs_warp.pipelines.world import BodyKey, PlacedBody, World
@@ -129,9 +131,16 @@ def simulate_world(
     style: Style | None = None,
     pushes: Mapping[OtherKey, Sequence[Push]] | None = None,
     get_up: bool = True,
+    parts: Callable[[str], Path] | None = None,
+    resume: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
 ) -> WorldRun:
-    """Simulate a world; the arguments are described at ``simulate``."""
+    """Simulate a world; the other arguments are described at ``simulate``.
+
+    Args:
+        parts: Function that returns the folder for the finished steps of the body with a name; None writes none.
+        resume: Folder of the interrupted run of this world to continue; the steps are in the folders of the bodies.
+    """
     check_frames(frames)
     if not world.members:
         raise UserError("world: it has no body; add a creature or a prop")
@@ -154,6 +163,14 @@ def simulate_world(
             if member.name != name
         }
 
+    def recording(name: str) -> RolloutOptions:
+        """Return the folder for the steps of a body, and the folder of its recorded steps, if it has any."""
+        recorded = None if resume is None else resume / name / PARTS
+        return {
+            "parts": None if parts is None else partial(parts, name),
+            "resume": recorded if recorded is not None and (recorded / FIRST_PART).is_file() else None,
+        }
+
     for member in world.members:
         name, body = member.name, member.body
         if isinstance(body, Creature):
@@ -172,11 +189,19 @@ def simulate_world(
                 raise UserError(f"{name}: {error}") from error
             motion, kicks, front = performer.watch, performer.kicks, body.front.direction
             runs.append(
-                BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame, front=front, kicks=kicks)
+                BodyRun(
+                    *(body.stepper, body.geometry, body.start, motion),
+                    place=body.frame,
+                    front=front,
+                    kicks=kicks,
+                    **recording(name),
+                )
             )
         else:
             motion = passive[name] = PassiveMotion(body)
-            runs.append(BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame))
+            runs.append(
+                BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame, **recording(name))
+            )
     settling = round(_PROP_TIME * FRAME_RATE) if passive and frames is None else 0
     limit = max([performer.frame_limit for performer in performers.values()], default=0) + settling
     limit = limit if frames is None else frames - 1
