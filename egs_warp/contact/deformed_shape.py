@@ -36,12 +36,14 @@ class DeformedShape:
         self.positions = wp.array(mesh.nodes[None], dtype=Vec3, device=device)
         """(1, N) m, current positions of the nodes."""
         self._tets = wp.array(mesh.tets, dtype=wp.vec4i, device=device)
-        self._lowers, self._uppers = (empty(len(mesh.tets), wp.vec3, device) for _ in range(2))
+        self.boxes = [empty(len(mesh.tets), wp.vec3, device) for _ in range(2)]
+        """Lower and upper corners of the inflated boxes of the tetrahedra."""
         self._compute_boxes()
-        self._hierarchy = wp.Bvh(self._lowers, self._uppers, groups=zeros(len(mesh.tets), int, device))
+        lowers, uppers = self.boxes
+        self.hierarchy = wp.Bvh(lowers, uppers, groups=zeros(len(mesh.tets), int, device))
         rest = wp.array(rest_positions[None], dtype=Vec3, device=device)
         self.inputs: list[Any] = [
-            *(self._tets, rest, self._hierarchy.id, level_set.lattice),
+            *(self._tets, rest, self.hierarchy.id, level_set.lattice),
             level_set.on_device(device),
         ]
         """Constants of the kernels: tetrahedra, rest positions, hierarchy, lattice and coefficients."""
@@ -50,7 +52,7 @@ class DeformedShape:
         """Move the nodes to ``positions`` (N, 3)."""
         copy_into(self.positions, positions[None])
         self._compute_boxes()
-        self._hierarchy.refit()
+        self.hierarchy.refit()
 
     def _compute_boxes(self) -> None:
         inputs = [self._tets, self._margin, self.positions]
@@ -58,7 +60,7 @@ class DeformedShape:
             kernels.tet_boxes_kernel,
             (1, len(self._tets)),
             inputs=inputs,
-            outputs=[self._lowers, self._uppers],
+            outputs=self.boxes,
             device=self.device,
         )
 

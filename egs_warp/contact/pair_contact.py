@@ -188,9 +188,17 @@ class PairContactDetector:
     def _gaps(self, a: int, b: int) -> np.ndarray:
         first, second = self._states[a], self._states[b]
         launch_cached(
+            kernels.close_tets_kernel,
+            first.close_tets.shape,
+            inputs=[first.close_tets.shape[1], second.hierarchy.id, *first.boxes],
+            outputs=[first.close_tets],
+            device=self.device,
+        )
+        points = [*first.points, first.tet_from_point]
+        launch_cached(
             kernels.pair_gaps_kernel,
             first.gaps.shape,
-            inputs=[*first.points, *second.inputs, first.positions, second.positions],
+            inputs=[*points, *second.inputs, first.close_tets, first.positions, second.positions],
             outputs=[first.gaps, first.tets_of(second)],
             device=self.device,
         )
@@ -246,6 +254,9 @@ class _DeformedBody(DeformedShape):
             wp.array(mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device),
             wp.array(geometry.weights, dtype=Vec4, device=device),
         ]
+        self.tet_from_point = wp.array(geometry.tet_from_point, dtype=int, device=device)
+        self.close_tets = zeros((1, len(mesh.tets)), bool, device)
+        """Buffer for the tetrahedra that are close to another body."""
         self.gaps = zeros((1, len(geometry.weights)), real, device)
         self._tets_of: dict[_DeformedBody, wp.array] = {}
 
