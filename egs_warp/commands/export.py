@@ -79,9 +79,8 @@ def _export(args: argparse.Namespace) -> int:
         paths = [args.out]
     elif args.to == "skin":
         if isinstance(run, FinishedWorld):
-            raise UserError(
-                f"--to skin: a skin has one body; export the folder of a body, such as {args.folder / next(iter(run.bodies))}"
-            )
+            body = args.folder / next(iter(run.bodies))
+            raise UserError(f"--to skin: a skin has one body; export the folder of a body, such as {body}")
         export_skin(run, args.out, every=args.every, mesh=args.mesh)
         paths = [args.out]
     else:

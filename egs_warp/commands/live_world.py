@@ -32,7 +32,9 @@ def live_world(args: argparse.Namespace) -> int:
     session = WorldSession(scripted.world, live_page_bodies(scripted.world))
     server = PageServer([], port=args.port, feed=WorldFeed(session, title=Path(args.capture).name))
     with server.serve_in_background() as thread, reserve_core():
-        print(f"open {server.address}\nevery browser that opens it steers another creature; end with Ctrl-C", flush=True)
+        print(
+            f"open {server.address}\nevery browser that opens it steers another creature; end with Ctrl-C", flush=True
+        )
         if not args.no_browser:
             webbrowser.open(server.address)
         session.start()

@@ -80,7 +80,10 @@ def _reports(part: Mapping[str, np.ndarray], node_count: int, count: int) -> lis
     """Return the reports of a part after ``count`` steps of a body with ``node_count`` nodes."""
     reports = []
     nodes = part["contact_nodes"]
-    if part["positions"].shape[1:] != (node_count, 3) or not 0 <= nodes.min(initial=0) <= nodes.max(initial=0) < node_count:
+    if (
+        part["positions"].shape[1:] != (node_count, 3)
+        or not 0 <= nodes.min(initial=0) <= nodes.max(initial=0) < node_count
+    ):
         raise ValueError("its nodes are not those of the body")
     stages = part["stages"].tolist()
     bounds = np.searchsorted(part["contact_step"], np.arange(count, count + len(part["dt"]) + 1))

@@ -24,7 +24,6 @@ from egs_warp.pipelines.world_report import WorldReport
 from egs_warp.pipelines.world_run import WorldRun
 
 
-
 def write_world(
     run: WorldRun,
     out: Path | str | RunFolder,

@@ -68,9 +68,7 @@ def bundle_of(run: FinishedRun, *, every: int = 1, degree: int | None = None, li
     return Bundle(tuple(bodies), FRAME_RATE / every, len(steps), facts)
 
 
-def bundle_of_world(
-    world: FinishedWorld, *, every: int = 1, degree: int | None = None, licence: str = ""
-) -> Bundle:
+def bundle_of_world(world: FinishedWorld, *, every: int = 1, degree: int | None = None, licence: str = "") -> Bundle:
     """Return the bundle of a world, in which each body has its own cage. The arguments are those of
     ``export_bundle``."""
     frames = chosen_frames(world, frame=None, every=every)

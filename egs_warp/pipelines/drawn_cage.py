@@ -37,8 +37,8 @@ class DrawnCage:
 
     @classmethod
     def of(cls, mesh: TetMesh, shape: ContactShape | None = None) -> DrawnCage:
-        """Return the drawn cage of a body with the cage ``mesh`` at rest. ``shape`` has the level set of a prop; without
-        it, the surface is that of the tetrahedra."""
+        """Return the drawn cage of a body with the cage ``mesh`` at rest. ``shape`` has the level set of a prop; the
+        surface without it is that of the tetrahedra."""
         if shape is None or len(mesh.tets) > 1:
             return cls(mesh.nodes, mesh.tets, mesh.boundary_faces(), np.zeros((0, 4)))
         vertices, faces = _surface(mesh, shape)

@@ -105,12 +105,12 @@ class _BodyPrims:
         Sdf, _, UsdGeom, UsdVol, Vt = _modules()
         self._run, self._degree, self._deformer = run, degree, run.deformer()
         t = run.trajectory
-        self._drawn = DrawnCage.of(run.mesh, shape)
+        self._outer_cage = DrawnCage.of(run.mesh, shape)
         UsdGeom.Xform.Define(stage, path)
         self._splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"{path}/{SPLATS}")
         _write_constant(self._splats, with_degree(run.creature.splats, degree), Vt)
         self._cage = UsdGeom.Mesh.Define(stage, f"{path}/{CAGE}")
-        faces = self._drawn.surface
+        faces = self._outer_cage.surface
         self._cage.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
         self._cage.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
         self._cage.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
@@ -135,7 +135,7 @@ class _BodyPrims:
         run, t = self._run, self._run.trajectory
         step, code = int(run.steps[index]), float(index)
         nodes = t.positions[step]
-        positions = self._drawn.positions(nodes)
+        positions = self._outer_cage.positions(nodes)
         cloud = with_degree(self._deformer.deform(nodes).cloud, self._degree)
         # The first frame is also the default value, for programs and validators that do not specify a time.
         for at in (Usd.TimeCode.Default(), code) if is_first else (code,):
@@ -143,7 +143,7 @@ class _BodyPrims:
             _set_points(self._cage, positions, at, Vt)
             if self._soft_body is not None:
                 _set_points(self._soft_body, nodes, at, Vt)
-            self._cage.GetNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(_normals(positions[self._drawn.surface])), at)
+            self._cage.GetNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(_normals(positions[self._outer_cage.surface])), at)
         ends = run.creature.muscle_ends @ nodes
         segments = run.creature.muscle_segments
         _set_points(self._muscles, ends[segments].reshape(-1, 3), code, Vt, width=_WIDTH)

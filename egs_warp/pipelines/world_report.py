@@ -24,8 +24,8 @@ WORLD_AUDIT_LIMITS = {
     "normal_error": 1e-6,
     "penetration": 1e-2,
 }
-"""Upper limits of ``WorldAudit`` and ``PairAudit``; the works have none. Errors of a contact have the limits of contacts
-with the ground (``AUDIT_LIMITS``)."""
+"""Upper limits of ``WorldAudit`` and ``PairAudit``; the works have none. Errors of a contact have the limits of
+contacts with the ground (``AUDIT_LIMITS``)."""
 
 
 @dataclass(frozen=True)

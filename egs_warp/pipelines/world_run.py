@@ -199,9 +199,7 @@ def simulate_world(
             )
         else:
             motion = passive[name] = PassiveMotion(body)
-            runs.append(
-                BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame, **recording(name))
-            )
+            runs.append(BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame, **recording(name)))
     settling = round(_PROP_TIME * FRAME_RATE) if passive and frames is None else 0
     limit = max([performer.frame_limit for performer in performers.values()], default=0) + settling
     limit = limit if frames is None else frames - 1

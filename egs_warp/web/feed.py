@@ -29,9 +29,7 @@ from egs_warp.web.session import Session
 _HALF_VIEW_HEIGHT = 1.0
 """Half of the height that the initial camera shows, in body heights."""
 
-STYLES = {
-    name: {key: style[key] for key in STYLE_NAMES} for name, style in {"usual": vars(Style()), **PRESETS}.items()
-}
+STYLES = {name: {key: style[key] for key in STYLE_NAMES} for name, style in {"usual": vars(Style()), **PRESETS}.items()}
 """Named styles of jumps, for the page."""
 
 

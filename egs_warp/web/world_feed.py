@@ -126,7 +126,7 @@ class WorldPageFeed:
 
 
 def live_page_bodies(world: World) -> list[PageBody]:
-    """Return the bodies of ``world`` as the page draws them; the Gaussians of creatures are split for likely motions."""
+    """Return the bodies of ``world`` for the page; the Gaussians of creatures are split for likely motions."""
     camera = world_view(world)
     return [_page_body(member, camera) for member in world.members]
 

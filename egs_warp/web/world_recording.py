@@ -42,9 +42,7 @@ class WorldRecording(FinishedWorld):
         first = self.first.trajectory
         weights = [float(t.node_mass.sum() * np.linalg.norm(t.gravity)) for t in self.trajectories]
         forward = self.camera.rotation[2, :2]
-        curves = [
-            {**curve, "body": index} for index in range(len(self.bodies)) for curve in curve_facts(CURVES)
-        ]
+        curves = [{**curve, "body": index} for index in range(len(self.bodies)) for curve in curve_facts(CURVES)]
         facts = {
             "title": self.title,
             "rate": FRAME_RATE,

@@ -129,7 +129,7 @@ class WorldSession:
         for body in self.bodies:
             if isinstance(body.member.body, Creature):
                 body.place = initial_stance(body.member.body, step=self._dt)
-                body.steering = MotionScheduler(body.place, lambda line, body=body: self._tell(body, line))
+                body.steering = MotionScheduler(body.place, lambda line, body=body: self._send_line(body, line))
         if all(body.steering is None for body in self.bodies):
             raise UserError("world: it has no creature to steer; leave out prop: true of a body")
         self._paused, self._single_steps, self._index = False, 0, 0
@@ -232,7 +232,7 @@ class WorldSession:
         # An error in a step must not end the session.
         except Exception as error:
             print(f"egs-warp: live: {type(error).__name__}: {error}", file=sys.stderr)
-            self._tell_all("the solver failed; all bodies are back at their start")
+            self._send_line_to_all("the solver failed; all bodies are back at their start")
             self._reset()
             return
         for body, reports in zip(self.bodies, done, strict=True):
@@ -330,11 +330,11 @@ class WorldSession:
         for page in list(self.pages):
             page.mailbox.send(frame)
 
-    def _tell_all(self, line: str) -> None:
+    def _send_line_to_all(self, line: str) -> None:
         for page in list(self.pages):
             page.mailbox.send_line(line)
 
-    def _tell(self, body: SteeredBody, line: str) -> None:
+    def _send_line(self, body: SteeredBody, line: str) -> None:
         """Send a line about a creature to the pages that steer it."""
         for page in list(self.pages):
             if self.bodies[page.selected] is body:

@@ -62,7 +62,11 @@ def test_a_stage_has_a_prim_for_each_body(folder: Path, tmp_path: Path) -> None:
     names = [prim.GetName() for prim in stage.GetDefaultPrim().GetChildren()]
     assert names == ["block", "box_1", "physics", "ground"]
     for name, has_volume in (("block", True), ("box_1", False)):
-        assert stage.GetPrimAtPath(f"/world/{name}/splats").GetAttribute("positions").GetTimeSamples() == [0.0, 4.0, 8.0]
+        assert stage.GetPrimAtPath(f"/world/{name}/splats").GetAttribute("positions").GetTimeSamples() == [
+            0.0,
+            4.0,
+            8.0,
+        ]
         assert bool(stage.GetPrimAtPath(f"/world/{name}/soft_body")) is has_volume
 
 
@@ -78,7 +82,7 @@ def test_incomplete_folders_are_reported(folder: Path, tmp_path: Path, capsys: p
     assert f"--to skin: a skin has one body; export the folder of a body, such as {folder / 'block'}" in (
         capsys.readouterr().err
     )
-    with pytest.raises(UserError, match="background .*: a run of a world has no capture behind its bodies"):
+    with pytest.raises(UserError, match=r"background .*: a run of a world has no capture behind its bodies"):
         read_finished(folder, background=tmp_path / "a.ply")
     shape = (folder / "block" / SHAPE).read_bytes()
     (folder / "block" / SHAPE).write_bytes((folder / "box-1" / SHAPE).read_bytes())
