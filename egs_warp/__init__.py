@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.animate_world import write_world
     from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
     from egs_warp.pipelines.job import Job
-    from egs_warp.pipelines.many import JobResult, simulate_many
+    from egs_warp.pipelines.many import JobResult, WorldJobResult, simulate_many
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
     from egs_warp.pipelines.prop import Prop, make_prop
     from egs_warp.pipelines.report import Report
@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.train_capture import TrainResult, train
     from egs_warp.pipelines.world import PlacedBody, World
     from egs_warp.pipelines.world_file import WorldScript, read_world
+    from egs_warp.pipelines.world_job import BodyOutcome, WorldJob
     from egs_warp.pipelines.world_report import WorldReport
     from egs_warp.pipelines.world_run import WorldRun
     from egs_warp.render.autograd import render_torch
@@ -112,7 +113,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "pipelines.animate_world": ("write_world",),
     "pipelines.creature": ("Creature", "CreatureOptions", "make_creature"),
     "pipelines.job": ("Job",),
-    "pipelines.many": ("JobResult", "simulate_many"),
+    "pipelines.many": ("JobResult", "WorldJobResult", "simulate_many"),
     "pipelines.simulated_run": ("SimulatedRun",),
     "pipelines.simulation": ("simulate",),
     "pipelines.prepare_scene": ("PreparedScene", "SceneOptions", "prepare_scene"),
@@ -122,6 +123,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "pipelines.train_capture": ("TrainResult", "train"),
     "pipelines.world": ("PlacedBody", "World"),
     "pipelines.world_file": ("WorldScript", "read_world"),
+    "pipelines.world_job": ("BodyOutcome", "WorldJob"),
     "pipelines.world_report": ("WorldReport",),
     "pipelines.world_run": ("WorldRun",),
     "render.autograd": ("render_torch",),
@@ -149,6 +151,7 @@ __all__ = [
     "AnimateOptions",
     "ArgumentError",
     "BodyMotion",
+    "BodyOutcome",
     "Box",
     "Camera",
     "Capture",
@@ -197,6 +200,8 @@ __all__ = [
     "UserError",
     "VideoWriter",
     "World",
+    "WorldJob",
+    "WorldJobResult",
     "WorldReport",
     "WorldRun",
     "WorldScript",

@@ -161,7 +161,8 @@ export class Ground {
             float strength = max(0.4 * line(p, pixel, cell), line(p, pixel, 4.0 * cell));
             vec3 ground = mix(${LOOK.floor}, ${LOOK.line}, strength);
             vec2 uv = 0.5 + 0.5 * (p - shadeCentre) / shadeHalf;
-            if (all(greaterThan(uv, box.xy)) && all(lessThan(uv, box.zw))) ground *= egsShade(shade, uv, ${SOFTNESS}, spread);
+            bool inside = all(greaterThan(uv, box.xy)) && all(lessThan(uv, box.zw));
+            if (inside) ground *= egsShade(shade, uv, ${SOFTNESS}, spread);
             float middle = eye.z / max(-forward.z, ${LOOK.minSlope}), depth = dot(vec3(p, 0.0) - eye, forward);
             float haze = smoothstep(${LOOK.clear} * middle, ${LOOK.hazy} * middle, depth);
             colour = mix(ground, ${LOOK.horizon}, haze);

@@ -54,7 +54,8 @@ export class Viewer extends Stage {
     const relighting = light && { irradiance: light.irradiance, normals: bytesOf(header, "splats_normals") };
     const bodies: Body[] = [{ splats: splatsOf(header, "splats"), track, relighting }];
     if (header.arrays.has("scene_means")) bodies.push({ splats: splatsOf(header, "scene") });
-    this.bodies = new Bodies(bodies, { shadow: this.ground.shadow, hasMarks: header.facts.picking ?? header.facts.bodies !== undefined });
+    const hasMarks = header.facts.picking ?? header.facts.bodies !== undefined;
+    this.bodies = new Bodies(bodies, { shadow: this.ground.shadow, hasMarks });
     this.overlays = new Overlays(header, (frame) => this.computeCentre(frame.positions));
     this.scene.add(this.bodies.object, this.overlays.group);
     this.bounds = this.runBounds();
