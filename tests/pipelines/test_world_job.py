@@ -24,9 +24,8 @@ from tests.support.live_sessions import coarse_pawn
 def test_jobs_of_a_world_have_the_bits_of_a_run_alone(tmp_path: Path) -> None:
     pawn, world = coarse_pawn(), World(friction=0.7)
     world.add(pawn, heading=0.0, name="jumper")
-    world.add(
-        make_prop(pawn.cloud, up=np.array([0.0, 0.0, 1.0]), height=0.4, density=200), at=(0.55, 0.0), name="target"
-    )
+    target = make_prop(pawn.cloud, up=np.array([0.0, 0.0, 1.0]), height=0.4, density=200)
+    world.add(target, at=(0.55, 0.0), name="target")
     jobs = [WorldJob({"jumper": "jump 0.3"}, frames=6), WorldJob({"knight": "jump"}, frames=6)]
     first, second = simulate_many(world, jobs, workers=1, out=tmp_path)
     alone = jobs[0].run(world)
@@ -41,7 +40,7 @@ def test_jobs_of_a_world_have_the_bits_of_a_run_alone(tmp_path: Path) -> None:
 
 def test_jobs_of_a_creature_are_no_jobs_of_a_world() -> None:
     jobs: Any = [Job(motion("jump"))]
-    with pytest.raises(UserError, match=r"jobs .*give only egs\.WorldJob, because they are jobs of a world"):
+    with pytest.raises(UserError, match=r"jobs: give only egs\.WorldJob, because they are jobs of a world"):
         simulate_many(World(), jobs)
     with pytest.raises(UserError, match="worlds 4: batches are for one creature"):
         simulate_many(World(), [WorldJob()], worlds=4)  # pyright: ignore[reportCallIssue]
