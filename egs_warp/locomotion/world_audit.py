@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from scipy.interpolate import NdBSpline
@@ -80,8 +80,9 @@ class ContactShape:
         """Read a file that ``save`` wrote. Raises ``UserError`` if it is missing or invalid."""
         try:
             arrays = read_arrays(path)
-            shape = cls(**{each.name: arrays[each.name] for each in fields(cls)})
-            shape = replace(shape, spacing=float(shape.spacing))
+            values: dict[str, Any] = {each.name: arrays[each.name] for each in fields(cls)}
+            values["spacing"] = float(values["spacing"])
+            shape = cls(**values)
             shape._check()
         except FileNotFoundError as error:
             raise UserError(f"{path}: is missing; run egs-warp animate again to write it") from error

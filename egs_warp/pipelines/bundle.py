@@ -48,8 +48,11 @@ def export_bundle(
     check_no_file_of_a_run(path)
     if path.suffix.lower() != ENDING:
         raise UserError(f"{path}: give a name that ends in {ENDING}")
-    bundle = bundle_of_world if isinstance(run, FinishedWorld) else bundle_of
-    write_bundle(path, bundle(run, every=every, degree=degree, licence=licence))
+    if isinstance(run, FinishedWorld):
+        bundle = bundle_of_world(run, every=every, degree=degree, licence=licence)
+    else:
+        bundle = bundle_of(run, every=every, degree=degree, licence=licence)
+    write_bundle(path, bundle)
 
 
 def bundle_of(run: FinishedRun, *, every: int = 1, degree: int | None = None, licence: str = "") -> Bundle:

@@ -13,7 +13,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
-from egs_warp.locomotion.rollout import FRAME_RATE, BodyRun, RolloutOptions, RolloutResult
+from egs_warp.locomotion.rollout import FRAME_RATE, BodyRun, RolloutResult
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import FIRST_PART, Trajectory
 from egs_warp.locomotion.world_rollout import roll_out_world, world_steps
@@ -163,13 +163,14 @@ def simulate_world(
             if member.name != name
         }
 
-    def recording(name: str) -> RolloutOptions:
-        """Return the folder for the steps of a body, and the folder of its recorded steps, if it has any."""
-        recorded = None if resume is None else resume / name / PARTS
-        return {
-            "parts": None if parts is None else partial(parts, name),
-            "resume": recorded if recorded is not None and (recorded / FIRST_PART).is_file() else None,
-        }
+    def parts_of(name: str) -> Callable[[], Path] | None:
+        """Return the function that returns the folder for the steps of a body."""
+        return None if parts is None else partial(parts, name)
+
+    def recorded(name: str) -> Path | None:
+        """Return the folder of the recorded steps of a body; None if it has none."""
+        folder = None if resume is None else resume / name / PARTS
+        return folder if folder is not None and (folder / FIRST_PART).is_file() else None
 
     for member in world.members:
         name, body = member.name, member.body
@@ -194,12 +195,23 @@ def simulate_world(
                     place=body.frame,
                     front=front,
                     kicks=kicks,
-                    **recording(name),
+                    parts=parts_of(name),
+                    resume=recorded(name),
                 )
             )
         else:
             motion = passive[name] = PassiveMotion(body)
-            runs.append(BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame, **recording(name)))
+            runs.append(
+                BodyRun(
+                    body.stepper,
+                    body.geometry,
+                    body.start,
+                    motion,
+                    place=body.frame,
+                    parts=parts_of(name),
+                    resume=recorded(name),
+                )
+            )
     settling = round(_PROP_TIME * FRAME_RATE) if passive and frames is None else 0
     limit = max([performer.frame_limit for performer in performers.values()], default=0) + settling
     limit = limit if frames is None else frames - 1

@@ -81,7 +81,7 @@ class LiveFeed:
         return creature_header(
             facts | {"max_stretch": deformer.max_stretch},
             render_data,
-            **cage_arrays(mesh, deformer),
+            cage=cage_arrays(mesh, deformer),
             node_mass=body.node_mass,
             planes=planes,
             scene=self._scene,

@@ -19,7 +19,7 @@ from egs_warp.deformation.joint_deformer import JointDeformer
 from egs_warp.pipelines.drawn_cage import DrawnCage
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.short_repr import short_repr
-from egs_warp.web.recording import arms_of, creature_header
+from egs_warp.web.recording import CageArrays, arms_of, creature_header
 
 
 @dataclass(frozen=True)
@@ -91,13 +91,15 @@ def joint_header(
     return creature_header(
         {**facts, "bodies": parts, "max_stretch": bodies[0].deformer.max_stretch},
         replace(data, splats=joint.rest),
-        rest=np.concatenate([body.cage.nodes for body in bodies]),
-        tets=np.concatenate([body.cage.tets + node for body, node in zip(bodies, nodes, strict=True)]),
-        surface=np.concatenate([body.cage.surface + node for body, node in zip(bodies, nodes, strict=True)]),
+        cage=CageArrays(
+            rest=np.concatenate([body.cage.nodes for body in bodies]),
+            tets=np.concatenate([body.cage.tets + node for body, node in zip(bodies, nodes, strict=True)]),
+            surface=np.concatenate([body.cage.surface + node for body, node in zip(bodies, nodes, strict=True)]),
+            mean_tets=np.concatenate(mean_tets),
+            arms=np.concatenate(arms),
+        ),
         node_mass=np.concatenate([_padded(body.node_mass, count) for body, count in zip(bodies, counts, strict=True)]),
         planes=planes,
-        mean_tets=np.concatenate(mean_tets),
-        arms=np.concatenate(arms),
         scene=None,
         more=more,
     )
@@ -106,12 +108,13 @@ def joint_header(
 def _joint_render_data(bodies: Sequence[PageBody], nodes: Sequence[int], counts: Sequence[int]) -> RenderData:
     """Return the muscles and feet of all bodies; the Gaussians are those of the first body."""
     all_data = [body.render_data for body in bodies]
-    ends = _starts([data.muscle_ends.shape[0] for data in all_data])
+    end_counts = [len(data.muscle_ends.indptr) - 1 for data in all_data]
+    ends = _starts(end_counts)
     fibres = _starts([len(data.fibre_names) for data in all_data])
     feet = _starts([int(data.foot_from_node.max(initial=-1)) + 1 for data in all_data])
     widened = [
         sp.csr_matrix((data.muscle_ends.data, data.muscle_ends.indices, data.muscle_ends.indptr), (rows, count))
-        for data, count, rows in zip(all_data, counts, (data.muscle_ends.shape[0] for data in all_data), strict=True)
+        for data, count, rows in zip(all_data, counts, end_counts, strict=True)
     ]
     foot_from_node = [
         _padded(np.where(data.foot_from_node >= 0, data.foot_from_node + foot, -1), count, -1)

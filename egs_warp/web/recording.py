@@ -31,6 +31,22 @@ CURVES = (
 
 
 @dataclass(frozen=True)
+class CageArrays:
+    """Cage of N nodes and T tetrahedra, and the embedding of n' Gaussians."""
+
+    rest: np.ndarray
+    """(N, 3) m, nodes at rest."""
+    tets: np.ndarray
+    """(T, 4) nodes of the tetrahedra."""
+    surface: np.ndarray
+    """(B, 3) nodes of the surface triangles."""
+    mean_tets: np.ndarray
+    """(n',) tetrahedron of each Gaussian, see ``Deformer.plan``."""
+    arms: np.ndarray
+    """(r, 15) arms of Gaussians that extend over several tetrahedra (``arms_of``)."""
+
+
+@dataclass(frozen=True)
 class Recording(FinishedRun):
     """A finished run that is encoded as packets."""
 
@@ -56,7 +72,7 @@ class Recording(FinishedRun):
         return creature_header(
             facts | {"max_stretch": deformer.max_stretch},
             self.creature,
-            **cage_arrays(self.mesh, deformer),
+            cage=cage_arrays(self.mesh, deformer),
             node_mass=t.node_mass,
             planes=t.planes,
             scene=self.scene_without_shadow(),
@@ -91,13 +107,9 @@ def creature_header(
     facts: Mapping[str, Any],
     render_data: RenderData,
     *,
-    rest: np.ndarray,
-    tets: np.ndarray,
-    surface: np.ndarray,
+    cage: CageArrays,
     node_mass: np.ndarray,
     planes: np.ndarray,
-    mean_tets: np.ndarray,
-    arms: np.ndarray,
     scene: GaussianCloud | None,
     more: Mapping[str, np.ndarray] | None = None,
 ) -> bytes:
@@ -106,13 +118,9 @@ def creature_header(
     Args:
         facts: JSON values of the run; the values of the muscles and the camera are added.
         render_data: Gaussians, muscles, feet and camera.
-        rest: (N, 3) m, nodes of the cage at rest.
-        tets: (T, 4) nodes of the tetrahedra.
-        surface: (B, 3) nodes of the surface triangles.
+        cage: cage and embedding.
         node_mass: (N,) kg, mass of each node.
         planes: (P, 4) rows n, d of the ground planes.
-        mean_tets: (n',) tetrahedron of each Gaussian, see ``Deformer.plan``.
-        arms: (r, 15) arms of Gaussians that extend over several tetrahedra (``arms_of``).
         scene: background or None; if there is a main light, without the shadow of the object.
         more: further arrays by name.
     """
@@ -131,20 +139,20 @@ def creature_header(
         "antialiased": render_data.splats.antialiased,
     }
     arrays = {
-        "rest": rest.astype(np.float32),
-        "tets": tets.astype(np.int32),
+        "rest": cage.rest.astype(np.float32),
+        "tets": cage.tets.astype(np.int32),
         "node_mass": node_mass.astype(np.float32),
         "planes": planes.astype(np.float32),
-        "surface": surface.astype(np.int32),
-        "edges": _edges(surface),
+        "surface": cage.surface.astype(np.int32),
+        "edges": _edges(cage.surface),
         "muscle_end_starts": render_data.muscle_ends.indptr.astype(np.int32),
         "muscle_end_nodes": render_data.muscle_ends.indices.astype(np.int32),
         "muscle_end_weights": render_data.muscle_ends.data.astype(np.float32),
         "muscle_segments": render_data.muscle_segments.astype(np.int32),
         "fibre_from_segment": render_data.fibre_from_segment.astype(np.int32),
         "foot_from_node": render_data.foot_from_node.astype(np.int32),
-        "mean_tets": mean_tets,
-        "arms": arms,
+        "mean_tets": cage.mean_tets,
+        "arms": cage.arms,
         **splat_arrays("splats", render_data.splats),
         **(more or {}),
     }
@@ -157,15 +165,9 @@ def creature_header(
     return header(facts, arrays)
 
 
-def cage_arrays(mesh: TetMesh, deformer: Deformer) -> dict[str, np.ndarray]:
-    """Return the arguments of ``creature_header`` for one cage and its embedded Gaussians."""
-    return {
-        "rest": mesh.nodes,
-        "tets": mesh.tets,
-        "surface": mesh.boundary_faces(),
-        "mean_tets": deformer.plan.mean_tets.numpy(),
-        "arms": arms_of(deformer),
-    }
+def cage_arrays(mesh: TetMesh, deformer: Deformer) -> CageArrays:
+    """Return the arrays of one cage and its embedded Gaussians."""
+    return CageArrays(mesh.nodes, mesh.tets, mesh.boundary_faces(), deformer.plan.mean_tets.numpy(), arms_of(deformer))
 
 
 def _edges(faces: np.ndarray) -> np.ndarray:

@@ -43,4 +43,4 @@ def test_jobs_of_a_creature_are_no_jobs_of_a_world() -> None:
     with pytest.raises(UserError, match=r"jobs: give only egs\.WorldJob, because they are jobs of a world"):
         simulate_many(World(), jobs)
     with pytest.raises(UserError, match="worlds 4: batches are for one creature"):
-        simulate_many(World(), [WorldJob()], worlds=4)  # pyright: ignore[reportCallIssue]
+        simulate_many(World(), [WorldJob()], worlds=4)  # pyright: ignore[reportCallIssue, reportArgumentType]

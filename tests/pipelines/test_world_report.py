@@ -13,7 +13,8 @@ from egs_warp.pipelines.world_report import WorldReport
 
 
 def _report(*, momentum: float = 0.0, body: dict[str, float] | None = None, **pair: float) -> WorldReport:
-    audit = Audit(**({each.name: 0 for each in fields(Audit)} | (body or {})))
+    numbers: dict[str, Any] = {each.name: 0 for each in fields(Audit)} | (body or {})
+    audit = Audit(**numbers)
     row: Any = SimpleNamespace(audit=audit, state=State.DONE)
     values: dict[str, Any] = {each.name: 0.0 for each in fields(PairAudit)} | {"bodies": (0, 1)} | pair
     world = WorldAudit(momentum, 0.0, (PairAudit(**values),))
@@ -23,7 +24,7 @@ def _report(*, momentum: float = 0.0, body: dict[str, float] | None = None, **pa
 def test_a_correct_world_passes() -> None:
     report = _report(penetration=0.01, friction_work=-3.0)
     assert report.summary().splitlines() == ["king: jumped", "box: fell", "audit: passed"]
-    written = report.to_json()
+    written: Any = report.to_json()
     assert written["verdict"] == "audit: passed" and written["bodies"]["king"]["audit"] == "audit: passed"
     (pair,) = written["audit"]["pairs"]
     assert pair["bodies"] == ["king", "box"] and pair["friction_work"] == -3.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,7 +17,9 @@ from egs_warp.fem.body import BodyState
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.rollout import BodyRun
+from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.world_audit import ContactShape, audit_world
 from egs_warp.locomotion.world_rollout import roll_out_world
 from egs_warp.locomotion.world_stepper import WorldStepper
@@ -34,8 +37,8 @@ _RAMP = Solid((Plane(np.array([0.0, -0.6, 0.8]), 0.6), Plane(np.array([0.0, 1.0,
 class _Passive:
     """Motion without objectives."""
 
-    def objectives(self, *_: object) -> list:
-        return []
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
+        return ()
 
 
 def box_cloud(size: tuple[float, float, float], colour: float = 0.4) -> GaussianCloud:

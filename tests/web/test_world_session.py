@@ -72,7 +72,8 @@ def test_each_page_steers_its_own_creature(session: WorldSession) -> None:
         "friction and stiffness of a world are those of its file; change them there",
         "a world records no takes; egs-warp animate writes its run",
     ]
-    for wrong in ({"type": "select", "body": "box"}, {"type": "select"}, {"type": "select", "body": 3}):
+    invalid: list[dict[str, object]] = [{"type": "select", **more} for more in ({"body": "box"}, {}, {"body": 3})]
+    for wrong in invalid:
         with pytest.raises(ValueError, match="select: "):
             second.receive(wrong)
     second.close()
