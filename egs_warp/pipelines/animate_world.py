@@ -81,9 +81,8 @@ def write_world(
             feet = result.place.feet() if isinstance(result, SimulatedRun) else ()
             render_data_of_body = RenderData.of(body.deformer.rest, camera, result.body.muscles, feet)
             render_data_of_body.save(folder.path / name / render_data.FILE, deformer=body.deformer)
-        audit = audit_world(
-            [result.simulation.trajectory for result in run.results], [body.shape for body in filmed.bodies.values()]
-        )
+        shapes = [body.shape for body in filmed.bodies.values()]
+        audit = audit_world([result.simulation.trajectory for result in run.results], shapes)
         video = draw_world_film(filmed, camera, folder, shot=shot, shadow=shadow, quiet=quiet) if film else None
         whole = WorldReport(reports, results, audit, run.stopped, video, tuple(notes), asked or {})
         write_report(folder.file("report.json"), whole.to_json())
