@@ -21,6 +21,8 @@ _CLICK_ON = """(index) => {
     for (let node = first; node < first + count; node++) {
         const point = viewer.nodePosition(node).project(viewer.camera);
         const at = [box.left + (0.5 + 0.5 * point.x) * box.width, box.top + (0.5 - 0.5 * point.y) * box.height];
+        // The positions of clicks are whole pixels.
+        at.forEach((value, k) => { at[k] = Math.round(value); });
         const hit = viewer.pick(...at);
         if (hit !== undefined && viewer.bodyOf(hit.node) === index) return at;
     }
