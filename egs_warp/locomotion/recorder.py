@@ -69,10 +69,14 @@ class Recorder:
         Args:
             reports: their reports, in order.
             request_digest: ``replay.digest`` of the objectives and of ``kick``; only read when a run is continued.
-            kick: (N, 3) m/s, velocities that external pushes added to the nodes at the start of the step.
+            kick: (N, 3) m/s, velocities that external pushes added to the nodes at the start of the step. The drives
+                of the reports are recorded as kicks, too.
         """
         if kick is not None:
             self._kicks.append((self._steps + len(self._reports), kick))
+        drives = enumerate(report.drive for report in reports)
+        first = self._steps + len(self._reports)
+        self._kicks += [(first + index, drive) for index, drive in drives if drive is not None]
         self._reports += reports
         self._requests += [(self._requested_steps, request_digest)] * len(reports)
         self._requested_steps += 1
@@ -204,11 +208,14 @@ class Recorder:
 
 
 def _frames(reports: Sequence[StepReport]) -> dict[str, np.ndarray]:
-    """Return the frames (n, 3, 3) of all contacts, and their gaps (n,) at the starts of the steps, m. Only a continued
-    run reads them."""
+    """Return the values that only a continued run reads: the frames (n, 3, 3) of all contacts and their gaps (n,) at
+    the starts of the steps, m; and the drives (d, N, 3), m/s, of the steps ``drive_row`` (d,) of the part."""
+    driven = [(row, report.drive) for row, report in enumerate(reports) if report.drive is not None]
     return {
         "contact_axes": np.concatenate([report.contacts.axes for report in reports]),
         "contact_start_gap": np.concatenate([report.contacts.gaps for report in reports]),
+        "drive_row": np.array([row for row, _ in driven], np.int32),
+        "drive_velocity": np.array([drive for _, drive in driven]).reshape(-1, *reports[0].state.positions.shape),
     }
 
 

@@ -86,6 +86,7 @@ def _reports(part: Mapping[str, np.ndarray], node_count: int, count: int) -> lis
     ):
         raise ValueError("its nodes are not those of the body")
     stages = part["stages"].tolist()
+    drives = dict(zip(part["drive_row"].tolist(), part["drive_velocity"], strict=True))
     bounds = np.searchsorted(part["contact_step"], np.arange(count, count + len(part["dt"]) + 1))
     for row, (first, end) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
         laps = zip(stages, part["milliseconds"][row].tolist(), strict=True)
@@ -107,6 +108,7 @@ def _reports(part: Mapping[str, np.ndarray], node_count: int, count: int) -> lis
             min_gap=float(part["min_gap"][row]),
             activations=part["activations"][row],
             **{name: part[name][row].item() for name in REPORTED},
+            drive=drives.get(row),
             milliseconds={stage: lap for stage, lap in laps if not np.isnan(lap)},
         )
         reports.append(report)
