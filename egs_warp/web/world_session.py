@@ -115,6 +115,8 @@ class WorldSession:
 
     def __init__(self, world: World, page_bodies: Sequence[PageBody]) -> None:
         """Create a session that is not started. Raises ``UserError`` for a world without a creature."""
+        if not any(isinstance(member.body, Creature) for member in world.members):
+            raise UserError("world: it has no creature to steer; leave out prop: true of a body")
         self.world, self.page_bodies = world, tuple(page_bodies)
         self.changed = threading.Condition()
         """Condition that the mailboxes of all pages share."""
@@ -130,8 +132,6 @@ class WorldSession:
             if isinstance(body.member.body, Creature):
                 body.place = initial_stance(body.member.body, step=self._dt)
                 body.steering = MotionScheduler(body.place, lambda line, body=body: self._send_line(body, line))
-        if all(body.steering is None for body in self.bodies):
-            raise UserError("world: it has no creature to steer; leave out prop: true of a body")
         self._paused, self._single_steps, self._index = False, 0, 0
         self._stopping = False
         self._thread = threading.Thread(target=self._run_loop, name="world session", daemon=True)
