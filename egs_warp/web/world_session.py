@@ -73,7 +73,10 @@ class SteeredBody:
 
     @property
     def is_resting(self) -> bool:
-        """True if the body is still and has no task."""
+        """True if the body is still and has no task, and its path has ended, if it follows one."""
+        path = self.member.path
+        if path is not None and (path.repeat or self.state.time < path.end):
+            return False
         is_idle = self.steering is None or self.steering.idle
         return is_idle and not self.forces.has_input and self.stillness.is_still(self.state)
 
@@ -298,9 +301,11 @@ class WorldSession:
             body.forces.pull(body.member.body.body, Pull(node - first, target))
 
     def _reset(self) -> None:
-        """Put all bodies back to their start."""
+        """Put all bodies back to their start; those that follow a path stay on it."""
         memories = self._stepper.initial_memories()
         for body, memory in zip(self.bodies, memories, strict=True):
+            if body.member.path is not None:
+                continue
             start = body.member.body.start
             body.state = BodyState(start.positions.copy(), np.zeros_like(start.positions), body.state.time)
             body.memory, body.report = memory, None
