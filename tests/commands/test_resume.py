@@ -42,6 +42,7 @@ WORLD = """
 bodies:
   - {name: jumper, capture: pawn.ply, up: z, nodes: 50, heading: 0, motion: jump 0.3}
   - {name: target, capture: pawn.ply, up: z, prop: true, density: 100, height: 0.5, at: [0.55, 0]}
+  - {name: lift, capture: pawn.ply, up: z, prop: true, height: 0.2, at: [0, 1.5], path: [{time: 0.5, above: 0.2}]}
 """
 KEYS = [{"time": 0.4, "part": "head", "quantity": "position", "value": [0, 0, -0.05]}]
 
@@ -201,7 +202,7 @@ def test_a_world_continues_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.
     assert len(parts) > 2 and not (out / "report.json").exists()
     parts[-1].unlink()
     assert cli.main(["resume", str(out)]) == status
-    for name in ("jumper", "target"):
+    for name in ("jumper", "target", "lift"):
         assert (out / name / "trajectory.npz").read_bytes() == (whole / name / "trajectory.npz").read_bytes()
         assert not (out / name / "trajectory.parts").exists()
     assert (out / "world.mp4").read_bytes() == (whole / "world.mp4").read_bytes()
