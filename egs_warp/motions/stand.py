@@ -11,9 +11,14 @@ from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.capture_step import capture_motion
+from egs_warp.motions.jump import Jump
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import REST_SPEED, BalanceController, RestDetector, Weights, sole_shares
+from egs_warp.motions.walk import Walk
 
+MAX_CAPTURE_STEPS = 3
+"""Maximum number of capture steps of one stand."""
 _RATE = 4.0
 """Rate in sqrt(g / H) at which the centre of mass returns over the feet."""
 
@@ -125,11 +130,14 @@ class StandFor:
         self.seconds, self._stand, self._stance = seconds, Stand(stance), stance
         self._started: float | None = None
         self._is_over = False
+        self._step: Walk | Jump | None = None
+        self.step_count = 0
+        """Number of capture steps that have begun."""
 
     @property
     def is_at_rest(self) -> bool:
         """True if the time has passed and the body is at rest."""
-        return self._is_over and self._stand.is_at_rest
+        return self._is_over and self._step is None and self._stand.is_at_rest
 
     @property
     def expected_time(self) -> float:
@@ -165,4 +173,13 @@ class StandFor:
         the previous step."""
         self._started = state.time if self._started is None else self._started
         self._is_over = state.time - self._started >= self.seconds - 1e-9
-        return self._stand.objectives(state, report, dt)
+        if self._step is not None and self._step.is_at_rest:
+            self._stance, self._step = self._stance.moved_to(state.positions), None
+            self._stand = Stand(self._stance)
+        if self._step is None and report is not None and self.step_count < MAX_CAPTURE_STEPS:
+            controller = self._stand.controller
+            measurement = controller.measure(state, report)
+            self._step = capture_motion(self._stance, controller, measurement, state.positions, report)
+            self.step_count += self._step is not None
+        moving = self._stand if self._step is None else self._step
+        return list(moving.objectives(state, report, dt))
