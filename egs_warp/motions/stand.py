@@ -124,7 +124,8 @@ class Stand:
 
 
 class StandFor:
-    """Stand for ``seconds`` s, and then until the body is at rest."""
+    """Stand for ``seconds`` s, and then until the body is at rest. A body that loses its balance takes a capture step
+    (``egs_warp.motions.capture_step``)."""
 
     def __init__(self, stance: Stance, seconds: float) -> None:
         self.seconds, self._stand, self._stance = seconds, Stand(stance), stance
@@ -165,8 +166,9 @@ class StandFor:
         return StandOutcome(max(shifts), lean)
 
     def notes(self) -> list[str]:
-        """Return no messages: standing has no target."""
-        return []
+        """Return a message for the user about capture steps."""
+        count = self.step_count
+        return [f"{count} step{'s' * (count > 1)} or hop{'s' * (count > 1)} to keep the balance"] if count else []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
