@@ -13,6 +13,7 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.capture_step import capture_motion
 from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump_plan import JumpPhase
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import REST_SPEED, BalanceController, RestDetector, Weights, sole_shares
 from egs_warp.motions.walk import Walk
@@ -178,10 +179,12 @@ class StandFor:
         if self._step is not None and self._step.is_at_rest:
             self._stance, self._step = self._stance.moved_to(state.positions), None
             self._stand = Stand(self._stance)
-        if self._step is None and report is not None and self.step_count < MAX_CAPTURE_STEPS:
+        has_landed = self._step is None or (isinstance(self._step, Jump) and self._step.phase is JumpPhase.LAND)
+        if has_landed and report is not None and self.step_count < MAX_CAPTURE_STEPS:
             controller = self._stand.controller
             measurement = controller.measure(state, report)
-            self._step = capture_motion(self._stance, controller, measurement, state.positions, report)
-            self.step_count += self._step is not None
+            step = capture_motion(self._stance, controller, measurement, state.positions, report)
+            if step is not None:
+                self._step, self.step_count = step, self.step_count + 1
         moving = self._stand if self._step is None else self._step
         return list(moving.objectives(state, report, dt))
