@@ -59,10 +59,12 @@ def stood(creature: Creature, line: str) -> Row:
     }
 
 
-def largest(creature: Creature, kind: str, result: str = "withstood", *, least: float = 0.0) -> tuple[float, list[Row]]:
+def largest(
+    creature: Creature, kind: str, result: str = "withstood", *, minimum: float = 0.0
+) -> tuple[float, list[Row]]:
     """Return the strongest push of ``kind`` with a ``result``, "withstood" or "recovered", and the rows of all pushes
-    that were tried; a push of ``least`` m sqrt(g H) is known to have it."""
-    low, high, tried = round(least / STEP), MAX_STEPS + 1, []
+    that were tried; a push of ``minimum`` m sqrt(g H) is known to have it."""
+    low, high, tried = round(minimum / STEP), MAX_STEPS + 1, []
     while high - low > 1:
         middle = (low + high) // 2
         tried.append(stood(creature, kind.format(f"{middle * STEP:.2f}")))
@@ -86,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         creature = make_creature(built.object, plane=built.plane, options=CreatureOptions(nodes=options.nodes))
         for kind in options.pushes[:1] if options.quick else options.pushes:
             (size, tried), milliseconds = timed(largest, creature, kind)
-            (recovered, more), longer = timed(largest, creature, kind, "recovered", least=size)
+            (recovered, more), longer = timed(largest, creature, kind, "recovered", minimum=size)
             tried, milliseconds = [*tried, *more], milliseconds + longer
             rows.append({"body": name, "kind": kind, "largest": size, "recovered": recovered, "tried": tried})
             worst = max(row["energy_residual"] for row in tried)

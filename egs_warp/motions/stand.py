@@ -134,7 +134,7 @@ class StandFor:
         self._is_over = False
         self._step: Walk | Jump | None = None
         self.step_count = 0
-        """Number of capture steps that have begun."""
+        """Number of capture steps so far."""
 
     @property
     def is_at_rest(self) -> bool:
