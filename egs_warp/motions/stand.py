@@ -169,7 +169,7 @@ class StandFor:
     def notes(self) -> list[str]:
         """Return a message for the user about capture steps."""
         count = self.step_count
-        return [f"{count} step{'s' * (count > 1)} or hop{'s' * (count > 1)} to keep the balance"] if count else []
+        return [f"took {count} step{'s' * (count > 1)} to keep its balance"] if count else []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
