@@ -7,7 +7,6 @@ from typing import Any
 from egs_warp.motions.hop import Hop
 from egs_warp.motions.joined_motion import JoinedMotion
 from egs_warp.motions.sequence import MotionSequence
-from egs_warp.motions.stand import StandFor
 from egs_warp.motions.turn import Turn
 
 
@@ -22,8 +21,6 @@ def joined_motion(sequence: MotionSequence) -> JoinedMotion[Any] | None:
         joined = motion.jumps[-1]
     elif isinstance(motion, Hop):
         joined = motion.jump
-    elif isinstance(motion, StandFor):
-        joined = motion.stand
     if not isinstance(joined, JoinedMotion):
         return None
     may_continue = isinstance(motion, Turn) or not sequence.is_finished

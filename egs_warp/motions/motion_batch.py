@@ -1,6 +1,6 @@
 """Motions of many worlds of one body on a device.
 
-Standing, jumps, hops and twists are computed for all worlds at once: the device reduces each state to some hundred
+Jumps, hops and twists are computed for all worlds at once: the device reduces each state to some hundred
 numbers, one transfer brings them to the host, the state machines run with a world axis (``MotionWorlds``), and a kernel
 makes the rows of the objectives. Other motions are evaluated one world after the other.
 """

@@ -12,12 +12,18 @@ from egs_warp.locomotion.reduced_objectives import ReducedObjectives
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.balance import Weights
+from egs_warp.motions.capture_step import capture_motion
 from egs_warp.motions.free_turn import rotations_of
 from egs_warp.motions.joined_motion import JoinedMotion, MotionWorlds
+from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump_plan import JumpPhase
 from egs_warp.motions.moments import ReducedState
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import REST_SPEED, BalanceController, sole_shares, update_rest
+from egs_warp.motions.walk import Walk
 
+MAX_CAPTURE_STEPS = 3
+"""Maximum number of capture steps of one stand."""
 _RATE = 4.0
 """Rate in sqrt(g / H) at which the centre of mass returns over the feet."""
 
@@ -72,10 +78,6 @@ class StandWorlds(MotionWorlds):
     """(c,) s, time since which the body is slow, see ``update_rest``."""
     rests: np.ndarray
     """(c,) bool, True if the body is at rest."""
-    began: np.ndarray
-    """(c,) s, time of the first step; NaN before."""
-    time: np.ndarray
-    """(c,) s, time of the last step."""
 
     @property
     def is_resting(self) -> np.ndarray:
@@ -85,8 +87,6 @@ class StandWorlds(MotionWorlds):
     def step(self, state: ReducedState, dt: float) -> ReducedObjectives:
         """Return the objectives of the time step of ``dt`` seconds from ``state`` and detect rest."""
         balance, measurement = self.current, self.current.measure(state)
-        self.began[:] = np.where(np.isnan(self.began), state.time, self.began)
-        self.time[:] = state.time
         is_slow = np.linalg.norm(measurement.velocity, axis=1) <= REST_SPEED * self.speed_unit
         operands = self.slow_since, measurement.velocity, state.time, self.speed_unit, self.time_unit
         self.slow_since[:], at_rest = update_rest(*operands)
@@ -148,8 +148,6 @@ class Stand(JoinedMotion[StandWorlds]):
                 turn=np.zeros((1, 3)),
                 slow_since=np.array([np.nan]),
                 rests=np.array([at_rest]),
-                began=np.array([np.nan]),
-                time=np.array([np.nan]),
             ),
         )
 
@@ -170,26 +168,27 @@ class Stand(JoinedMotion[StandWorlds]):
         """True if the body is at rest."""
         return bool(self._worlds.rests[self._row])
 
-    @property
-    def elapsed(self) -> float:
-        """Time in seconds from the first to the last time step; NaN before the first."""
-        return float(self._worlds.time[self._row] - self._worlds.began[self._row])
-
     def notes(self) -> list[str]:
         """Return no messages: standing has no target."""
         return []
 
 
 class StandFor:
-    """Stand for ``seconds`` s, and then until the body is at rest."""
+    """Stand for ``seconds`` s, and then until the body is at rest. A body that loses its balance takes a capture step
+    (``egs_warp.motions.capture_step``)."""
 
     def __init__(self, stance: Stance, seconds: float) -> None:
-        self.seconds, self.stand, self._stance = seconds, Stand(stance), stance
+        self.seconds, self._stand, self._stance = seconds, Stand(stance), stance
+        self._started: float | None = None
+        self._is_over = False
+        self._step: Walk | Jump | None = None
+        self.step_count = 0
+        """Number of capture steps so far."""
 
     @property
     def is_at_rest(self) -> bool:
         """True if the time has passed and the body is at rest."""
-        return self.stand.elapsed >= self.seconds - 1e-9 and self.stand.is_at_rest
+        return self._is_over and self._step is None and self._stand.is_at_rest
 
     @property
     def expected_time(self) -> float:
@@ -217,10 +216,24 @@ class StandFor:
         return StandOutcome(max(shifts), lean)
 
     def notes(self) -> list[str]:
-        """Return no messages: standing has no target."""
-        return []
+        """Return a message for the user about capture steps."""
+        count = self.step_count
+        return [f"took {count} step{'s' * (count > 1)} to keep its balance"] if count else []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
         the previous step."""
-        return self.stand.objectives(state, report, dt)
+        self._started = state.time if self._started is None else self._started
+        self._is_over = state.time - self._started >= self.seconds - 1e-9
+        if self._step is not None and self._step.is_at_rest:
+            self._stance, self._step = self._stance.moved_to(state.positions), None
+            self._stand = Stand(self._stance)
+        has_landed = self._step is None or (isinstance(self._step, Jump) and self._step.phase is JumpPhase.LAND)
+        if has_landed and report is not None and self.step_count < MAX_CAPTURE_STEPS:
+            controller = self._stand.controller
+            measurement = controller.measure(state, report)
+            step = capture_motion(self._stance, controller, measurement, state.positions, report)
+            if step is not None:
+                self._step, self.step_count = step, self.step_count + 1
+        moving = self._stand if self._step is None else self._step
+        return list(moving.objectives(state, report, dt))
