@@ -110,6 +110,12 @@ def screen_covariance(row_x: wp.vec3, row_y: wp.vec3) -> ScreenCovariance:
     return covariance
 
 
+@wp.func
+def colour_and_depth(sum: wp.vec3, depth: wp.float32) -> wp.vec4:
+    """Return the colour for an SH sum, and the depth."""
+    return wp.vec4(wp.max(sum[0] + 0.5, 0.0), wp.max(sum[1] + 0.5, 0.0), wp.max(sum[2] + 0.5, 0.0), depth)
+
+
 @wp.kernel
 def project_kernel(
     first: wp.int32,
@@ -127,7 +133,7 @@ def project_kernel(
     colour_depth_out: wp.array[wp.vec4],
     tile_count_out: wp.array[wp.int64],
 ):
-    """Compute screen ellipse, falloff and colour of every Gaussian; an invisible Gaussian reaches no tile.
+    """Compute screen ellipse, falloff and colour of every Gaussian (CUDA); an invisible Gaussian reaches no tile.
 
     The ellipse is stored in Cholesky form: with u = dx + shear dy, -ln(alpha / opacity) = a u^2 + v dy^2. Its terms are
     all positive, whereas the usual conic suffers cancellation for long thin splats.
@@ -180,6 +186,4 @@ def project_kernel(
     tile_count_out[g] = wp.int64(tiles)
     ellipse_out[g] = ellipse
     falloff_out[g] = falloff
-    colour_depth_out[g] = wp.vec4(
-        wp.max(colour[0] + 0.5, 0.0), wp.max(colour[1] + 0.5, 0.0), wp.max(colour[2] + 0.5, 0.0), p[2]
-    )
+    colour_depth_out[g] = colour_and_depth(colour, p[2])
