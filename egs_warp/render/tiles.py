@@ -9,12 +9,8 @@ import numpy as np
 import warp as wp
 
 from egs_warp.kernels.render.ellipse import TILE
-from egs_warp.kernels.render.tiles import (
-    count_tiles_kernel,
-    emit_tiles_kernel,
-    fill_tiles_kernel,
-    finish_lists_kernel,
-)
+from egs_warp.kernels.render.tiles import emit_tiles_kernel, finish_lists_kernel
+from egs_warp.kernels.render.tiles_cpu import count_tiles_kernel, fill_tiles_kernel
 from egs_warp.launching import device_of, empty, empty_pooled, grow_capacity, launch_cached, launch_rows, zeros
 from egs_warp.render.projection import ProjectedGaussians
 
@@ -82,20 +78,19 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
 
     # Near Gaussians reach more tiles than far ones, so chunks have equal numbers of pairs instead of Gaussians.
     chunks = min(8 + 4 * threads, max(1, visible_count // 256)) if threads > 1 else 1
-    # One Gaussian in eight is a sufficient sample.
-    pairs_done = np.cumsum(slot_counts[by_depth[:visible_count:8]])
-    inner = 8 * np.searchsorted(pairs_done, np.arange(1, chunks) * (pairs_done[-1] / chunks)) if chunks > 1 else []
+    pairs_done = np.concatenate([[0], np.cumsum(slot_counts[by_depth[:visible_count]])])
+    inner = np.searchsorted(pairs_done, np.arange(1, chunks) * (pairs / chunks))
     edges = np.concatenate([[0], inner, [visible_count]]).astype(np.int32)
-    chunk_start = wp.array(edges, dtype=wp.int32, device=device)
-    tile_from_slot, gaussians, slots = (empty(max(pairs, 1), wp.int32, device) for _ in range(3))
+    chunk_start, pair_start = (wp.array(part, dtype=wp.int32, device=device) for part in (edges, pairs_done[edges]))
+    tile_from_pair, gaussians, slots = (empty(max(pairs, 1), wp.int32, device) for _ in range(3))
     counts = zeros((chunks, tiles), wp.int32, device)
     walk = {"device": device, "threads": threads, "work": np.ones(chunks)}
-    shared = [chunk_start, order, projected.slot_end]
+    shared = [chunk_start, pair_start, order]
     launch_rows(
         count_tiles_kernel,
         chunks,
         inputs=[view.width, view.height, *shared, projected.ellipse, projected.falloff],
-        outputs=[tile_from_slot, counts],
+        outputs=[tile_from_pair, counts],
         **walk,
     )
     work = counts.numpy().sum(axis=0)
@@ -103,7 +98,13 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
     # In each tile, the entries of a chunk follow the entries of the previous chunks, which are nearer.
     cursor = counts.numpy()
     cursor[:] = np.cumsum(cursor, axis=0) - cursor + tile_start[:-1]
-    launch_rows(fill_tiles_kernel, chunks, inputs=[*shared, tile_from_slot], outputs=[counts, gaussians, slots], **walk)
+    launch_rows(
+        fill_tiles_kernel,
+        chunks,
+        inputs=[*shared, projected.slot_end, tile_from_pair],
+        outputs=[counts, gaussians, slots],
+        **walk,
+    )
     return TileLists(wp.array(tile_start, dtype=wp.int32, device=device), gaussians, slots, work)
 
 

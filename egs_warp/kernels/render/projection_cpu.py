@@ -121,11 +121,11 @@ _SETTINGS = f"""
             const wp::vec2 f(out[4][i], out[5][i]);
             int row, last_row, tiles = 0;
             tile_rows_of(e, f, row, last_row);
-            for (; row <= last_row; row += 8) {
-                i8 from, to;
+            for (; row <= last_row; row += 4) {
+                i4 from, to;
                 tile_spans(e, f, row, from, to);
-                const i8 steps = {0, 1, 2, 3, 4, 5, 6, 7};
-                tiles += __builtin_reduce_add(row + steps <= last_row ? to - from + 1 : i8(0));
+                const i4 steps = {0, 1, 2, 3};
+                tiles += __builtin_reduce_add(row + steps <= last_row ? to - from + 1 : i4(0));
             }
             tile_count.data[g] = tiles;
             ellipse.data[g] = e;

@@ -5,8 +5,9 @@ Clang maps the vector types to the SIMD instructions of the processor.
 
 VECTORS = """
     #pragma clang fp contract(fast)
+    typedef float f4 __attribute__((ext_vector_type(4)));
+    typedef int i4 __attribute__((ext_vector_type(4)));
     typedef float f8 __attribute__((ext_vector_type(8)));
-    typedef int i8 __attribute__((ext_vector_type(8)));
     typedef float f16 __attribute__((ext_vector_type(16)));
     typedef int i16 __attribute__((ext_vector_type(16)));
     typedef bool b16 __attribute__((ext_vector_type(16)));
@@ -55,30 +56,27 @@ EXP_AND_LOG = """
 """
 
 TILE_SPANS = """
-    // First and last tile column of an ellipse in eight tile rows from `row` on; first > last where there is none.
+    // First and last tile column of an ellipse in four tile rows from `row` on; first > last where there is none.
     // Contraction is off, so that every kernel computes the same bits.
-    auto tile_spans = [&](const wp::vec4& e, const wp::vec2& f, int row, i8& first, i8& last) {
+    auto tile_spans = [&](const wp::vec4& e, const wp::vec2& f, int row, i4& first, i4& last) {
         #pragma clang fp contract(off)
-        const float cut = f[1] + LOG_255, v = f[0], a = e[2], shear = e[3];
-        const f8 steps = {0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f};
-        const f8 top = (16.0f * (steps + (float)row) + 0.5f) - e[1];
-        const f8 edge = 16.0f * (steps + (float)row) + 16.0f, image_end = (float)height;
-        const f8 bottom = ((edge < image_end ? edge : image_end) - 0.5f) - e[1];
+        const float cut = f[1] + LOG_255, v = f[0], a = e[2], shear = e[3], end = (float)height;
         const float tip = -shear * __builtin_sqrtf(cut * a / (v * (v + a * shear * shear)));
-        const f8 tip_right = tip, tip_left = -tip;
-        const f8 dy_right = tip_right < top ? top : (tip_right > bottom ? bottom : tip_right);
-        const f8 dy_left = tip_left < top ? top : (tip_left > bottom ? bottom : tip_left);
-        const f8 none = 0.0f, image_side = (float)(width - 1);
-        const f8 right_margin = cut - v * dy_right * dy_right, left_margin = cut - v * dy_left * dy_left;
-        const f8 right = (e[0] - shear * dy_right)
-            + __builtin_elementwise_sqrt((right_margin > none ? right_margin : none) / a) - 0.5f;
-        const f8 left = (e[0] - shear * dy_left)
-            - __builtin_elementwise_sqrt((left_margin > none ? left_margin : none) / a) - 0.5f;
-        const i8 from = __builtin_convertvector(__builtin_elementwise_ceil(left > none ? left : none), i8);
-        const i8 to = __builtin_convertvector(
-            __builtin_elementwise_floor(right < image_side ? right : image_side), i8);
-        first = from <= to ? from >> 4 : i8(1);
-        last = from <= to ? to >> 4 : i8(0);
+        // Places 0 to 3 are the right ends, 4 to 7 the left ones.
+        const f8 side = {1.0f, 1.0f, 1.0f, 1.0f, -1.0f, -1.0f, -1.0f, -1.0f};
+        const f8 steps = {0.0f, 16.0f, 32.0f, 48.0f, 0.0f, 16.0f, 32.0f, 48.0f};
+        const f8 start = steps + 16.0f * (float)row, stop = start + 16.0f;
+        const f8 top = (start + 0.5f) - e[1], bottom = ((stop < end ? stop : f8(end)) - 0.5f) - e[1];
+        const f8 extreme = side * tip, low = extreme < bottom ? extreme : bottom, dy = low > top ? low : top;
+        const f8 margin = cut - v * dy * dy;
+        const f8 edge = (e[0] - shear * dy)
+            + side * __builtin_elementwise_sqrt((margin > 0.0f ? margin : f8(0.0f)) * (1.0f / a)) - 0.5f;
+        const f4 image_side = (float)(width - 1), right = edge.lo, left = edge.hi;
+        const i4 from = __builtin_convertvector(__builtin_elementwise_ceil(left > 0.0f ? left : f4(0.0f)), i4);
+        const i4 to = __builtin_convertvector(
+            __builtin_elementwise_floor(right < image_side ? right : image_side), i4);
+        first = from <= to ? from >> 4 : i4(1);
+        last = from <= to ? to >> 4 : i4(0);
     };
     // First and last tile row with a pixel centre inside the vertical extent of the ellipse; first > last if there is
     // none.

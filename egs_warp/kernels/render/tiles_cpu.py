@@ -1,0 +1,172 @@
+"""Kernels that list the Gaussians of every tile on a CPU, by a counting sort over chunks of the depth order.
+
+Gaussians in depth order are scattered in memory, so their data are prefetched. ``tiles`` defines slots and
+intersections; host code: ``egs_warp/render/tiles.py``.
+"""
+
+import warp as wp
+
+from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
+from egs_warp.kernels.render.vector_math import TILE_SPANS, on_cpu
+
+wp.set_module_options({"enable_backward": False})
+
+_AHEAD = "    constexpr int AHEAD = 12;"
+
+
+@wp.func_native(
+    on_cpu(
+        CUTOFFS_IN_CPP
+        + TILE_SPANS
+        + _AHEAD
+        + """
+    const int columns = (width + 15) / 16;
+    int* const counts = &count.data[(size_t)chunk * count.shape[1]];
+    int* tile_out = &tile_from_pair.data[pair_start.data[chunk]];
+    const int end = chunk_start.data[chunk + 1];
+    // Spans are computed for several Gaussians before any is used, because the lengths of the loops over them cannot be
+    // predicted.
+    constexpr int CAPACITY = 64;
+    int row_of[CAPACITY], rows_of[CAPACITY];
+    i4 from[CAPACITY], to[CAPACITY];
+    int rank = chunk_start.data[chunk], row = 1, last_row = 0;
+    wp::vec4 e;
+    wp::vec2 f;
+    while (rank < end || row <= last_row) {
+        int groups = 0;
+        while (groups < CAPACITY) {
+            if (row > last_row) {
+                if (rank == end) break;
+                const int next = gaussian_from_rank.data[rank + AHEAD < end ? rank + AHEAD : end - 1];
+                __builtin_prefetch(ellipse.data + next);
+                __builtin_prefetch(falloff.data + next);
+                const int g = gaussian_from_rank.data[rank++];
+                e = ellipse.data[g];
+                f = falloff.data[g];
+                tile_rows_of(e, f, row, last_row);
+            }
+            tile_spans(e, f, row, from[groups], to[groups]);
+            row_of[groups] = row;
+            rows_of[groups++] = last_row - row < 4 ? last_row - row + 1 : 4;
+            row += 4;
+        }
+        for (int i = 0; i < groups; ++i)
+            for (int k = 0; k < rows_of[i]; ++k) {
+                const int start = (row_of[i] + k) * columns;
+                for (int tile = start + from[i][k]; tile <= start + to[i][k]; ++tile) {
+                    *tile_out++ = tile;
+                    ++counts[tile];
+                }
+            }
+    }
+"""
+    )
+)
+def count_tiles(
+    chunk: wp.int32,
+    width: wp.int32,
+    height: wp.int32,
+    chunk_start: wp.array[wp.int32],
+    pair_start: wp.array[wp.int32],
+    gaussian_from_rank: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    tile_from_pair: wp.array[wp.int32],
+    count: wp.array2d[wp.int32],
+):
+    """See ``count_tiles_kernel``."""
+    ...
+
+
+@wp.kernel
+def count_tiles_kernel(
+    first_chunk: wp.int32,
+    # In:
+    width: wp.int32,
+    height: wp.int32,
+    chunk_start: wp.array[wp.int32],
+    pair_start: wp.array[wp.int32],
+    gaussian_from_rank: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    # Out:
+    tile_from_pair_out: wp.array[wp.int32],
+    count_out: wp.array2d[wp.int32],
+):
+    """Write the tiles of the Gaussians of one chunk, from pair ``pair_start[chunk]`` on, and count the Gaussians in
+    each tile. Pairs are numbered by depth here."""
+    count_tiles(
+        wp.tid() + first_chunk,
+        width,
+        height,
+        chunk_start,
+        pair_start,
+        gaussian_from_rank,
+        ellipse,
+        falloff,
+        tile_from_pair_out,
+        count_out,
+    )
+
+
+@wp.func_native(
+    on_cpu(
+        _AHEAD
+        + """
+    int* const cursors = &cursor.data[(size_t)chunk * cursor.shape[1]];
+    const int* tile = &tile_from_pair.data[pair_start.data[chunk]];
+    const int start = chunk_start.data[chunk], end = chunk_start.data[chunk + 1];
+    for (int rank = start; rank < end; ++rank) {
+        __builtin_prefetch(slot_end.data + gaussian_from_rank.data[rank + AHEAD < end ? rank + AHEAD : end - 1]);
+        const int g = gaussian_from_rank.data[rank];
+        const int last_slot = (int)slot_end.data[g];
+        for (int slot = g > 0 ? (int)slot_end.data[g - 1] : 0; slot < last_slot; ++slot) {
+            const int i = cursors[*tile++]++;
+            gaussians.data[i] = g;
+            slots.data[i] = slot;
+        }
+    }
+"""
+    )
+)
+def fill_tiles(
+    chunk: wp.int32,
+    chunk_start: wp.array[wp.int32],
+    pair_start: wp.array[wp.int32],
+    gaussian_from_rank: wp.array[wp.int32],
+    slot_end: wp.array[wp.int64],
+    tile_from_pair: wp.array[wp.int32],
+    cursor: wp.array2d[wp.int32],
+    gaussians: wp.array[wp.int32],
+    slots: wp.array[wp.int32],
+):
+    """See ``fill_tiles_kernel``."""
+    ...
+
+
+@wp.kernel
+def fill_tiles_kernel(
+    first_chunk: wp.int32,
+    # In:
+    chunk_start: wp.array[wp.int32],
+    pair_start: wp.array[wp.int32],
+    gaussian_from_rank: wp.array[wp.int32],
+    slot_end: wp.array[wp.int64],
+    tile_from_pair: wp.array[wp.int32],
+    # Out:
+    cursor_out: wp.array2d[wp.int32],
+    gaussian_from_intersection_out: wp.array[wp.int32],
+    slot_from_intersection_out: wp.array[wp.int32],
+):
+    """Append each Gaussian of a chunk to its tiles; ``cursor_out`` starts at the chunk's first entry in each tile."""
+    fill_tiles(
+        wp.tid() + first_chunk,
+        chunk_start,
+        pair_start,
+        gaussian_from_rank,
+        slot_end,
+        tile_from_pair,
+        cursor_out,
+        gaussian_from_intersection_out,
+        slot_from_intersection_out,
+    )
