@@ -31,33 +31,37 @@ _SHARED = (
     const int tile_height = height - top < 16 ? height - top : 16;
     const unsigned inside_rows = 0xFFu >> (8 - (tile_height + 1) / 2);
     unsigned open = tile_width > 0 ? inside_rows | (tile_width > 8 ? inside_rows << 8 : 0u) : 0u;
-    unsigned still_open = open;
-    // Refresh open, from the transmittances of the call before: its result would otherwise delay the next splat.
     auto refresh_open = [&](const float* passing) {
-        open = still_open;
         for (unsigned to_do = open; to_do != 0; to_do &= to_do - 1) {
             const int block = __builtin_ctz(to_do);
-            if (bits_of(*(const f16*)(passing + 16 * block) > none) == 0) still_open &= ~(1u << block);
+            if (bits_of(*(const f16*)(passing + 16 * block) > none) == 0) open &= ~(1u << block);
         }
     };
     auto column_of = [](int i) -> int { return (i >> 7) * 8 + (i & 7); };
     auto row_of = [](int i) -> int { return (i >> 3) & 15; };
+    struct Splat {
+        float x, y, shear, peak, steep_x, steep_y;
+        unsigned blocks;
+        wp::vec4 colour_depth;
+    };
+    constexpr int BATCH = 16;
+    Splat batch[BATCH];
 """
 )
 
 _EACH_BLOCK = """
-        if (i + 8 < end) {
-            const int next_id = gaussians.data[i + 8];
-            __builtin_prefetch(ellipse.data + next_id);
-            __builtin_prefetch(falloff.data + next_id);
-            __builtin_prefetch(colour_depth.data + next_id);
-        }
-        const wp::vec4 e = ellipse.data[id];
-        const wp::vec2 f = falloff.data[id];
-        const wp::vec4 c = colour_depth.data[id];
-        const float x = e[0] - (float)left - 0.5f, y = e[1] - (float)top - 0.5f;
-        unsigned reached;
-        {
+        for (int k = 0; k < count; ++k) {
+            // The number of blocks of a splat cannot be predicted: it is computed well before it is used.
+            const int id = gaussians.data[begin + k];
+            if (begin + k + BATCH < end) {
+                const int next_id = gaussians.data[begin + k + BATCH];
+                __builtin_prefetch(ellipse.data + next_id);
+                __builtin_prefetch(falloff.data + next_id);
+                __builtin_prefetch(colour_depth.data + next_id);
+            }
+            const wp::vec4 e = ellipse.data[id];
+            const wp::vec2 f = falloff.data[id];
+            const float x = e[0] - (float)left - 0.5f, y = e[1] - (float)top - 0.5f;
             const f16 dy = tile_rows - y;
             const f16 margin = f[1] + LOG_255 - f[0] * dy * dy;
             const f16 reach = __builtin_elementwise_sqrt((margin > none ? margin : none) * (1.0f / e[2])) + 1.0e-3f;
@@ -66,24 +70,29 @@ _EACH_BLOCK = """
             const i16 inside = margin > -1.0e-3f;
             const unsigned left_rows = bits_of(inside & (first <= 7.0f) & (last >= none));
             const unsigned right_rows = bits_of(inside & (first <= 15.0f) & (last >= 8.0f));
-            reached = ((left_rows | left_rows >> 8) & 0xFFu) | ((right_rows << 8 | right_rows) & 0xFF00u);
+            const unsigned blocks = ((left_rows | left_rows >> 8) & 0xFFu) | ((right_rows << 8 | right_rows) & 0xFF00u);
+            // log2 of alpha is peak - steep_y dy^2 - steep_x u^2.
+            batch[k] = {x, y, e[3], f[1] * LOG2_E, e[2] * LOG2_E, f[0] * LOG2_E, blocks & open, colour_depth.data[id]};
         }
-        // log2 of alpha is peak - steep_y dy^2 - steep_x u^2.
-        const f16 near_x = columns - x, near_y = rows - y;
-        const float peak = f[1] * LOG2_E, steep_x = e[2] * LOG2_E, steep_y = f[0] * LOG2_E;
-        for (unsigned to_do = reached & open; to_do != 0; to_do &= to_do - 1) {
-            const int block = __builtin_ctz(to_do), at = 16 * block;
-            const f16 dy = near_y + down[block];
-            const f16 u = near_x + across[block] + e[3] * dy;
-            const f16 level = peak - steep_y * dy * dy - steep_x * u * u;
-            // Undefined where the level is below the faintest.
-            const f16 whole = __builtin_elementwise_roundeven(level);
-            const f16 raw = power_of_two(whole, level - whole);
-            const f16 before = *(f16*)(passing + at);
-            const f16 alpha = (level >= faintest)ALSO_NEAR ? (raw < limit ? raw : limit) : none;
-            const f16 after = before - before * alpha;
-            const i16 stop = after <= stopped;
-            const f16 weight = stop ? none : before * alpha;
+        for (int k = 0; k < count; ++k) {
+            const wp::vec4 c = batch[k].colour_depth;
+            const float shear = batch[k].shear, peak = batch[k].peak;
+            const float steep_x = batch[k].steep_x, steep_y = batch[k].steep_y;
+            const f16 near_x = columns - batch[k].x, near_y = rows - batch[k].y;
+            BEFORE_BLOCKS
+            for (unsigned to_do = batch[k].blocks; to_do != 0; to_do &= to_do - 1) {
+                const int block = __builtin_ctz(to_do), at = 16 * block;
+                const f16 dy = near_y + down[block];
+                const f16 u = near_x + across[block] + shear * dy;
+                const f16 level = peak - steep_y * dy * dy - steep_x * u * u;
+                // Undefined where the level is below the faintest.
+                const f16 whole = __builtin_elementwise_roundeven(level);
+                const f16 raw = power_of_two(whole, level - whole);
+                const f16 before = *(f16*)(passing + at);
+                const f16 alpha = (level >= faintest)ALSO_NEAR ? (raw < limit ? raw : limit) : none;
+                const f16 after = before - before * alpha;
+                const i16 stop = after <= stopped;
+                const f16 weight = stop ? none : before * alpha;
 """
 
 FORWARD = (
@@ -99,17 +108,17 @@ FORWARD = (
         const float floor = bounded ? max_depth.data[(top + row_of(i)) * width + left + column_of(i)] : 0.0f;
         bound[i] = floor > 0.0f ? floor : 3.0e38f;
     }
-    for (int i = start; i < end && open != 0; ++i) {
-        if ((i - start) % 8 == 0) refresh_open(passing);
-        const int id = gaussians.data[i];
+    for (int begin = start; begin < end && open != 0; begin += BATCH, refresh_open(passing)) {
+        const int count = end - begin < BATCH ? end - begin : BATCH;
 """
-    + _EACH_BLOCK.replace("ALSO_NEAR", " & (c[3] <= *(f16*)(bound + at))")
+    + _EACH_BLOCK.replace("ALSO_NEAR", " & (c[3] <= *(f16*)(bound + at))").replace("BEFORE_BLOCKS", "")
     + """
-            *(f16*)(passing + at) = stop ? -__builtin_elementwise_abs(before) : after;
-            *(f16*)(red + at) += weight * c[0];
-            *(f16*)(green + at) += weight * c[1];
-            *(f16*)(blue + at) += weight * c[2];
-            *(f16*)(far + at) += weight * c[3];
+                *(f16*)(passing + at) = stop ? -__builtin_elementwise_abs(before) : after;
+                *(f16*)(red + at) += weight * c[0];
+                *(f16*)(green + at) += weight * c[1];
+                *(f16*)(blue + at) += weight * c[2];
+                *(f16*)(far + at) += weight * c[3];
+            }
         }
     }
     for (int row = 0; row < tile_height; ++row)
@@ -141,45 +150,44 @@ BACKWARD = (
         by_blue[i] = g[2];
         by_far[i] = g[3];
     }
-    for (int i = start; i < end; ++i) {
-        if ((i - start) % 8 == 0) refresh_open(passing);
-        float* out = (float*)moments.data + 12 * (size_t)slots.data[i];
-        if (open == 0) {
-            for (int q = 0; q < 12; ++q) out[q] = 0.0f;
-            continue;
-        }
-        const int id = gaussians.data[i];
-        f16 sums[10] = {};
+    auto out_of = [&](int i) -> float* { return (float*)moments.data + 12 * (size_t)slots.data[i]; };
+    int begin = start;
+    for (; begin < end && open != 0; begin += BATCH, refresh_open(passing)) {
+        const int count = end - begin < BATCH ? end - begin : BATCH;
 """
-    + _EACH_BLOCK.replace("ALSO_NEAR", "")
+    + _EACH_BLOCK.replace("ALSO_NEAR", "").replace("BEFORE_BLOCKS", "f16 sums[10] = {};")
     + """
-            *(f16*)(passing + at) = stop ? none : after;
-            const f16 red = *(f16*)(by_red + at), green = *(f16*)(by_green + at), blue = *(f16*)(by_blue + at);
-            const f16 far = *(f16*)(by_far + at);
-            const f16 value = c[0] * red + c[1] * green + c[2] * blue + c[3] * far;
-            const f16 behind = *(f16*)(rest + at) - weight * value;
-            *(f16*)(rest + at) = behind;
-            const f16 free = alpha * (before * value - behind / (one - alpha));
-            const f16 slope = ((weight > none) & (raw <= limit)) ? free : none;
-            const f16 moment = slope * u, moment_y = slope * dy;
-            sums[0] += slope;
-            sums[1] += moment;
-            sums[2] += moment_y;
-            sums[3] += moment * u;
-            sums[4] += moment * dy;
-            sums[5] += moment_y * dy;
-            sums[6] += weight * far;
-            sums[7] += weight * red;
-            sums[8] += weight * green;
-            sums[9] += weight * blue;
-        }
-        for (int q = 0; q < 10; ++q) {
-            const auto eight = sums[q].lo + sums[q].hi;
-            const auto four = eight.lo + eight.hi;
-            const auto two = four.lo + four.hi;
-            // Entry 7 is padding.
-            out[q + (q >= 7 ? 1 : 0)] = two[0] + two[1];
+                *(f16*)(passing + at) = stop ? none : after;
+                const f16 red = *(f16*)(by_red + at), green = *(f16*)(by_green + at), blue = *(f16*)(by_blue + at);
+                const f16 far = *(f16*)(by_far + at);
+                const f16 value = c[0] * red + c[1] * green + c[2] * blue + c[3] * far;
+                const f16 behind = *(f16*)(rest + at) - weight * value;
+                *(f16*)(rest + at) = behind;
+                const f16 free = alpha * (before * value - behind / (one - alpha));
+                const f16 slope = ((weight > none) & (raw <= limit)) ? free : none;
+                const f16 moment = slope * u, moment_y = slope * dy;
+                sums[0] += slope;
+                sums[1] += moment;
+                sums[2] += moment_y;
+                sums[3] += moment * u;
+                sums[4] += moment * dy;
+                sums[5] += moment_y * dy;
+                sums[6] += weight * far;
+                sums[7] += weight * red;
+                sums[8] += weight * green;
+                sums[9] += weight * blue;
+            }
+            float* out = out_of(begin + k);
+            for (int q = 0; q < 10; ++q) {
+                const auto eight = sums[q].lo + sums[q].hi;
+                const auto four = eight.lo + eight.hi;
+                const auto two = four.lo + four.hi;
+                // Entry 7 is padding.
+                out[q + (q >= 7 ? 1 : 0)] = two[0] + two[1];
+            }
         }
     }
+    for (; begin < end; ++begin)
+        for (int q = 0; q < 12; ++q) out_of(begin)[q] = 0.0f;
 """
 )
