@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -88,21 +89,21 @@ def backward(
             device=device,
         )
     else:
-        pixel_count = int(view.width) * int(view.height)
-        sum_gradient = empty(pixel_count, wp.vec4, device)
-        remaining = empty(pixel_count, wp.float32, device)
+        width, height = int(view.width), int(view.height)
+        sum_gradient, remaining = empty_pooled(device, ((height, width), wp.vec4), ((height, width), wp.float32))
         launch_rows(
             pixel_gradients_kernel,
-            pixel_count,
+            height,
             inputs=pixels,
             outputs=[sum_gradient, remaining],
             device=device,
             threads=threads,
+            work=np.ones(height),
         )
         launch_rows(
             composite_backward_tile_kernel,
             lists.tile_count,
-            inputs=[*tile_inputs, sum_gradient, remaining],
+            inputs=[*tile_inputs, sum_gradient.flatten(), remaining.flatten()],
             outputs=[moments],
             device=device,
             threads=threads,

@@ -150,6 +150,15 @@ BACKWARD = (
         by_blue[i] = g[2];
         by_far[i] = g[3];
     }
+    // Partial sums: places 0 and 1 sum to the sum of a, 2 and 3 to c, 4 and 5 to b, 6 and 7 to d.
+    auto sums_of_four = [](f8 a, f8 b, f8 c, f8 d) -> f8 {
+        const f8 p = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11)
+            + __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
+        const f8 q = __builtin_shufflevector(c, d, 0, 1, 2, 3, 8, 9, 10, 11)
+            + __builtin_shufflevector(c, d, 4, 5, 6, 7, 12, 13, 14, 15);
+        return __builtin_shufflevector(p, q, 0, 1, 8, 9, 4, 5, 12, 13)
+            + __builtin_shufflevector(p, q, 2, 3, 10, 11, 6, 7, 14, 15);
+    };
     auto out_of = [&](int i) -> float* { return (float*)moments.data + 12 * (size_t)slots.data[i]; };
     int begin = start;
     for (; begin < end && open != 0; begin += BATCH, refresh_open(passing)) {
@@ -178,13 +187,18 @@ BACKWARD = (
                 sums[9] += weight * blue;
             }
             float* out = out_of(begin + k);
-            for (int q = 0; q < 10; ++q) {
-                const auto eight = sums[q].lo + sums[q].hi;
-                const auto four = eight.lo + eight.hi;
-                const auto two = four.lo + four.hi;
-                // Entry 7 is padding.
-                out[q + (q >= 7 ? 1 : 0)] = two[0] + two[1];
-            }
+            f8 eight[12] = {};
+            for (int q = 0; q < 10; ++q) eight[q + (q >= 7 ? 1 : 0)] = sums[q].lo + sums[q].hi;
+            const f8 low = sums_of_four(eight[0], eight[4], eight[1], eight[5]);
+            const f8 high = sums_of_four(eight[2], eight[6], eight[3], eight[7]);
+            const f8 third = sums_of_four(eight[8], eight[10], eight[9], eight[11]);
+            // Transposed pairs are added last.
+            const f8 first_rows = __builtin_shufflevector(low, high, 0, 2, 8, 10, 4, 6, 12, 14)
+                + __builtin_shufflevector(low, high, 1, 3, 9, 11, 5, 7, 13, 15);
+            const f4 third_row = __builtin_shufflevector(third, third, 0, 2, 4, 6)
+                + __builtin_shufflevector(third, third, 1, 3, 5, 7);
+            __builtin_memcpy(out, &first_rows, sizeof(first_rows));
+            __builtin_memcpy(out + 8, &third_row, sizeof(third_row));
         }
     }
     for (; begin < end; ++begin)

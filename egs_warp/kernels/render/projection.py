@@ -62,7 +62,13 @@ def rotation_matrix(q: wp.vec4) -> wp.mat33:
 
 
 @wp.func
-def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple[wp.vec3, wp.vec3]:
+def scale_of(log_scale: wp.vec3) -> wp.vec3:
+    """Return the scales of a Gaussian, the diagonal of S."""
+    return wp.vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
+
+
+@wp.func
+def screen_axes(view: View, p: wp.vec3, q: wp.vec4, scale: wp.vec3) -> tuple[wp.vec3, wp.vec3]:
     """Return rows x and y of J W R S at the camera-space point ``p``; the screen covariance is their Gram matrix."""
     inv_z = 1.0 / p[2]
     # As in gsplat and Kerbl et al., the Jacobian is evaluated at most 15 % outside the image, because it grows without
@@ -73,7 +79,6 @@ def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple
     right = wp.vec3(axes[0, 0], axes[0, 1], axes[0, 2])
     down = wp.vec3(axes[1, 0], axes[1, 1], axes[1, 2])
     forward = wp.vec3(axes[2, 0], axes[2, 1], axes[2, 2])
-    scale = wp.vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
     row_x = view.fx * inv_z * (right - tx * forward)
     row_y = view.fy * inv_z * (down - ty * forward)
     return wp.cw_mul(row_x, scale), wp.cw_mul(row_y, scale)
@@ -151,7 +156,7 @@ def project_kernel(
     p = view.rotation * mean + view.translation
     if p[2] < view.near or p[2] > view.far:
         return
-    row_x, row_y = screen_axes(view, p, q, log_scale)
+    row_x, row_y = screen_axes(view, p, q, scale_of(log_scale))
     screen = screen_covariance(row_x, row_y)
     log_opacity = -wp.log(1.0 + wp.exp(-logit))
     if logit < -15.0:
