@@ -31,10 +31,10 @@ _SHARED = (
     const int tile_height = height - top < 16 ? height - top : 16;
     const unsigned inside_rows = 0xFFu >> (8 - (tile_height + 1) / 2);
     unsigned open = tile_width > 0 ? inside_rows | (tile_width > 8 ? inside_rows << 8 : 0u) : 0u;
-    auto refresh_open = [&](const float* passing) {
+    auto refresh_open = [&](const float* passing, int stride) {
         for (unsigned to_do = open; to_do != 0; to_do &= to_do - 1) {
             const int block = __builtin_ctz(to_do);
-            if (bits_of(*(const f16*)(passing + 16 * block) > none) == 0) open &= ~(1u << block);
+            if (bits_of(*(const f16*)(passing + stride * block) > none) == 0) open &= ~(1u << block);
         }
     };
     auto column_of = [](int i) -> int { return (i >> 7) * 8 + (i & 7); };
@@ -81,14 +81,15 @@ _EACH_BLOCK = """
             const f16 near_x = columns - batch[k].x, near_y = rows - batch[k].y;
             BEFORE_BLOCKS
             for (unsigned to_do = batch[k].blocks; to_do != 0; to_do &= to_do - 1) {
-                const int block = __builtin_ctz(to_do), at = 16 * block;
+                const int block = __builtin_ctz(to_do);
+                f16* const channels = (f16*)pixels + CHANNELS * block;
                 const f16 dy = near_y + down[block];
                 const f16 u = near_x + across[block] + shear * dy;
                 const f16 level = peak - steep_y * dy * dy - steep_x * u * u;
                 // Undefined where the level is below the faintest.
                 const f16 whole = __builtin_elementwise_roundeven(level);
                 const f16 raw = power_of_two(whole, level - whole);
-                const f16 before = *(f16*)(passing + at);
+                const f16 before = channels[PASSING];
                 const f16 alpha = (level >= faintest)ALSO_NEAR ? (raw < limit ? raw : limit) : none;
                 const f16 after = before - before * alpha;
                 const i16 stop = after <= stopped;
@@ -99,38 +100,44 @@ FORWARD = (
     _SHARED
     + """
     // Transmittance; zero outside the image, negative once a pixel is opaque.
-    alignas(64) float passing[256], red[256], green[256], blue[256], far[256], bound[256];
+    enum { PASSING, RED, GREEN, BLUE, FAR, BOUND, CHANNELS };
+    alignas(64) float pixels[16 * CHANNELS * 16];
     for (int i = 0; i < 256; ++i) {
         const bool inside = column_of(i) < tile_width && row_of(i) < tile_height;
-        passing[i] = inside ? 1.0f : 0.0f;
-        red[i] = green[i] = blue[i] = far[i] = 0.0f;
+        float* const pixel = pixels + (i >> 4) * 16 * CHANNELS + (i & 15);
+        pixel[16 * PASSING] = inside ? 1.0f : 0.0f;
+        for (int channel = RED; channel <= FAR; ++channel) pixel[16 * channel] = 0.0f;
         const bool bounded = inside && max_depth.shape[0] > 0;
         const float floor = bounded ? max_depth.data[(top + row_of(i)) * width + left + column_of(i)] : 0.0f;
-        bound[i] = floor > 0.0f ? floor : 3.0e38f;
+        pixel[16 * BOUND] = floor > 0.0f ? floor : 3.0e38f;
     }
-    for (int begin = start; begin < end && open != 0; begin += BATCH, refresh_open(passing)) {
+    for (int begin = start; begin < end && open != 0; begin += BATCH, refresh_open(pixels, 16 * CHANNELS)) {
         const int count = end - begin < BATCH ? end - begin : BATCH;
 """
-    + _EACH_BLOCK.replace("ALSO_NEAR", " & (c[3] <= *(f16*)(bound + at))").replace("BEFORE_BLOCKS", "")
+    + _EACH_BLOCK.replace("ALSO_NEAR", " & (c[3] <= channels[BOUND])").replace("BEFORE_BLOCKS", "")
     + """
-                *(f16*)(passing + at) = stop ? -__builtin_elementwise_abs(before) : after;
-                *(f16*)(red + at) += weight * c[0];
-                *(f16*)(green + at) += weight * c[1];
-                *(f16*)(blue + at) += weight * c[2];
-                *(f16*)(far + at) += weight * c[3];
+                channels[PASSING] = stop ? -__builtin_elementwise_abs(before) : after;
+                channels[RED] += weight * c[0];
+                channels[GREEN] += weight * c[1];
+                channels[BLUE] += weight * c[2];
+                channels[FAR] += weight * c[3];
             }
         }
     }
     for (int row = 0; row < tile_height; ++row)
         for (int column = 0; column < tile_width; ++column) {
             const int i = (column >> 3) * 128 + row * 8 + (column & 7), pixel = (top + row) * width + left + column;
-            const float through = passing[i] < 0.0f ? -passing[i] : passing[i];
+            const float* const from = pixels + (i >> 4) * 16 * CHANNELS + (i & 15);
+            const float signed_through = from[16 * PASSING];
+            const float through = signed_through < 0.0f ? -signed_through : signed_through;
             const wp::vec3 behind = background.shape[0] > 0 ? background.data[pixel] : flat_background;
             colour.data[pixel] = wp::vec3(
-                red[i] + through * behind[0], green[i] + through * behind[1], blue[i] + through * behind[2]
+                from[16 * RED] + through * behind[0],
+                from[16 * GREEN] + through * behind[1],
+                from[16 * BLUE] + through * behind[2]
             );
             alpha_out.data[pixel] = 1.0f - through;
-            depth.data[pixel] = through < 1.0f ? far[i] / (1.0f - through) : 0.0f;
+            depth.data[pixel] = through < 1.0f ? from[16 * FAR] / (1.0f - through) : 0.0f;
         }
 """
 )
@@ -138,17 +145,16 @@ FORWARD = (
 BACKWARD = (
     _SHARED
     + """
-    alignas(64) float passing[256], rest[256], by_red[256], by_green[256], by_blue[256], by_far[256];
+    enum { PASSING, REST, RED, GREEN, BLUE, FAR, CHANNELS };
+    alignas(64) float pixels[16 * CHANNELS * 16];
     for (int i = 0; i < 256; ++i) {
         const bool inside = column_of(i) < tile_width && row_of(i) < tile_height;
         const int pixel = inside ? (top + row_of(i)) * width + left + column_of(i) : 0;
         const wp::vec4 g = sum_gradient.data[pixel];
-        passing[i] = inside ? 1.0f : 0.0f;
-        rest[i] = remaining.data[pixel];
-        by_red[i] = g[0];
-        by_green[i] = g[1];
-        by_blue[i] = g[2];
-        by_far[i] = g[3];
+        float* const to = pixels + (i >> 4) * 16 * CHANNELS + (i & 15);
+        to[16 * PASSING] = inside ? 1.0f : 0.0f;
+        to[16 * REST] = remaining.data[pixel];
+        for (int k = 0; k < 4; ++k) to[16 * (RED + k)] = g[k];
     }
     // Partial sums: places 0 and 1 sum to the sum of a, 2 and 3 to c, 4 and 5 to b, 6 and 7 to d.
     auto sums_of_four = [](f8 a, f8 b, f8 c, f8 d) -> f8 {
@@ -161,17 +167,17 @@ BACKWARD = (
     };
     auto out_of = [&](int i) -> float* { return (float*)moments.data + 12 * (size_t)slots.data[i]; };
     int begin = start;
-    for (; begin < end && open != 0; begin += BATCH, refresh_open(passing)) {
+    for (; begin < end && open != 0; begin += BATCH, refresh_open(pixels, 16 * CHANNELS)) {
         const int count = end - begin < BATCH ? end - begin : BATCH;
 """
     + _EACH_BLOCK.replace("ALSO_NEAR", "").replace("BEFORE_BLOCKS", "f16 sums[10] = {};")
     + """
-                *(f16*)(passing + at) = stop ? none : after;
-                const f16 red = *(f16*)(by_red + at), green = *(f16*)(by_green + at), blue = *(f16*)(by_blue + at);
-                const f16 far = *(f16*)(by_far + at);
+                channels[PASSING] = stop ? none : after;
+                const f16 red = channels[RED], green = channels[GREEN], blue = channels[BLUE];
+                const f16 far = channels[FAR];
                 const f16 value = c[0] * red + c[1] * green + c[2] * blue + c[3] * far;
-                const f16 behind = *(f16*)(rest + at) - weight * value;
-                *(f16*)(rest + at) = behind;
+                const f16 behind = channels[REST] - weight * value;
+                channels[REST] = behind;
                 const f16 free = alpha * (before * value - behind / (one - alpha));
                 const f16 slope = ((weight > none) & (raw <= limit)) ? free : none;
                 const f16 moment = slope * u, moment_y = slope * dy;
