@@ -10,7 +10,12 @@ import warp as wp
 
 from egs_warp.kernels.render.ellipse import TILE
 from egs_warp.kernels.render.tiles import emit_tiles_kernel, finish_lists_kernel
-from egs_warp.kernels.render.tiles_cpu import count_tiles_kernel, fill_tiles_kernel
+from egs_warp.kernels.render.tiles_cpu import (
+    compact_visible_kernel,
+    count_tiles_kernel,
+    fill_tiles_kernel,
+    split_ranks_kernel,
+)
 from egs_warp.launching import device_of, empty, empty_pooled, grow_capacity, launch_cached, launch_rows, zeros
 from egs_warp.render.projection import ProjectedGaussians
 
@@ -66,23 +71,30 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
     """Build the lists by a counting sort over chunks of the depth order, in parallel and without comparing pairs."""
     device = device_of(projected.ellipse)
     pairs = projected.slot_count
-    slot_counts = np.diff(projected.slot_end.numpy(), prepend=0)
-    gaussian_from_visible = np.flatnonzero(slot_counts).astype(np.int32)
-    visible_count = len(gaussian_from_visible)
-    keys = empty(2 * max(visible_count, 1), wp.float32, device)
-    order = empty(2 * max(visible_count, 1), wp.int32, device)
-    keys.numpy()[:visible_count] = projected.colour_depth.numpy()[gaussian_from_visible, 3]
-    by_depth: np.ndarray = order.numpy()
-    by_depth[:visible_count] = gaussian_from_visible
+    count = projected.slot_end.shape[0]
+    # The sort needs twice the space of its data.
+    keys, order, visible = empty_pooled(device, (2 * count, wp.float32), (2 * count, wp.int32), (1, wp.int32))
+    launch_cached(
+        compact_visible_kernel,
+        1,
+        inputs=[projected.slot_end, projected.colour_depth],
+        outputs=[keys, order, visible],
+        device=device,
+    )
+    visible_count = int(visible.numpy()[0])
     wp.utils.radix_sort_pairs(keys, order, visible_count)
-
-    # Near Gaussians reach more tiles than far ones, so chunks have equal numbers of pairs instead of Gaussians.
     chunks = min(8 + 4 * threads, max(1, visible_count // 256)) if threads > 1 else 1
-    pairs_done = np.concatenate([[0], np.cumsum(slot_counts[by_depth[:visible_count]])])
-    inner = np.searchsorted(pairs_done, np.arange(1, chunks) * (pairs / chunks))
-    edges = np.concatenate([[0], inner, [visible_count]]).astype(np.int32)
-    chunk_start, pair_start = (wp.array(part, dtype=wp.int32, device=device) for part in (edges, pairs_done[edges]))
-    tile_from_pair, gaussians, slots = (empty(max(pairs, 1), wp.int32, device) for _ in range(3))
+    chunk_start, pair_start = empty_pooled(device, (chunks + 1, wp.int32), (chunks + 1, wp.int32))
+    launch_cached(
+        split_ranks_kernel,
+        1,
+        inputs=[visible_count, pairs, order, projected.slot_end],
+        outputs=[chunk_start, pair_start],
+        device=device,
+    )
+    capacity = grow_capacity(pairs)
+    (tile_from_pair,) = empty_pooled(device, (capacity, wp.int32))
+    gaussians, slots = empty_pooled(device, (capacity, wp.int32), (capacity, wp.int32))
     counts = zeros((chunks, tiles), wp.int32, device)
     walk = {"device": device, "threads": threads, "work": np.ones(chunks)}
     shared = [chunk_start, pair_start, order]

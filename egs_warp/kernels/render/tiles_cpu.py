@@ -7,9 +7,66 @@ intersections; host code: ``egs_warp/render/tiles.py``.
 import warp as wp
 
 from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
+from egs_warp.kernels.render.tiles import first_slot_of
 from egs_warp.kernels.render.vector_math import TILE_SPANS, on_cpu
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def compact_visible_kernel(
+    # In:
+    slot_end: wp.array[wp.int64],
+    colour_depth: wp.array[wp.vec4],
+    # Out:
+    depth_out: wp.array[wp.float32],
+    gaussian_out: wp.array[wp.int32],
+    count_out: wp.array[wp.int32],
+):
+    """List the Gaussians that reach a tile, and their depths, by one thread."""
+    count = wp.int32(0)
+    before = wp.int64(0)
+    for g in range(slot_end.shape[0]):
+        # Always written, because the branch could not be predicted.
+        depth_out[count] = colour_depth[g][3]
+        gaussian_out[count] = g
+        end = slot_end[g]
+        count += wp.where(end > before, 1, 0)
+        before = end
+    count_out[0] = count
+
+
+@wp.kernel
+def split_ranks_kernel(
+    # In:
+    visible_count: wp.int32,
+    pair_count: wp.int64,
+    gaussian_from_rank: wp.array[wp.int32],
+    slot_end: wp.array[wp.int64],
+    # Out:
+    chunk_start_out: wp.array[wp.int32],
+    pair_start_out: wp.array[wp.int32],
+):
+    """Split the depth order into chunks with equal numbers of pairs, by one thread.
+
+    Near Gaussians reach more tiles than far ones, so the chunks have different numbers of Gaussians.
+    """
+    chunks = chunk_start_out.shape[0] - 1
+    chunk = wp.int32(0)
+    pairs = wp.int64(0)
+    rank = wp.int32(0)
+    while rank < visible_count and chunk < chunks:
+        if pairs * wp.int64(chunks) >= pair_count * wp.int64(chunk):
+            chunk_start_out[chunk] = rank
+            pair_start_out[chunk] = wp.int32(pairs)
+            chunk += 1
+        g = gaussian_from_rank[rank]
+        pairs += slot_end[g] - wp.int64(first_slot_of(slot_end, g))
+        rank += 1
+    for rest in range(chunk, chunks + 1):
+        chunk_start_out[rest] = visible_count
+        pair_start_out[rest] = wp.int32(pair_count)
+
 
 _AHEAD = "    constexpr int AHEAD = 12;"
 
