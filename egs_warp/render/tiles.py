@@ -93,7 +93,7 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
         device=device,
     )
     capacity = grow_capacity(pairs)
-    (tile_from_pair,) = empty_pooled(device, (capacity, wp.int32))
+    (tile_from_pair,) = empty_pooled(device, (capacity + 4 * chunks, wp.int32))
     gaussians, slots = empty_pooled(device, (capacity, wp.int32), (capacity, wp.int32))
     counts = zeros((chunks, tiles), wp.int32, device)
     walk = {"device": device, "threads": threads, "work": np.ones(chunks)}

@@ -68,30 +68,33 @@ def split_ranks_kernel(
         pair_start_out[rest] = wp.int32(pair_count)
 
 
-_AHEAD = "    constexpr int AHEAD = 12;"
+_TILES_OF_CHUNK = """
+    constexpr int AHEAD = 12;
+    // Up to four entries after those of a chunk are overwritten.
+    auto tiles_of = [&](int chunk) -> int* { return &tile_from_pair.data[pair_start.data[chunk] + 4 * chunk]; };
+"""
 
 
 @wp.func_native(
     on_cpu(
         CUTOFFS_IN_CPP
         + TILE_SPANS
-        + _AHEAD
+        + _TILES_OF_CHUNK
         + """
-    const int columns = (width + 15) / 16;
-    int* const counts = &count.data[(size_t)chunk * count.shape[1]];
-    int* tile_out = &tile_from_pair.data[pair_start.data[chunk]];
-    const int end = chunk_start.data[chunk + 1];
-    // Spans are computed for several Gaussians before any is used, because the lengths of the loops over them cannot be
-    // predicted.
+    const int columns = (width + 15) / 16, end = chunk_start.data[chunk + 1];
+    const i4 steps = {0, 1, 2, 3};
+    int* const tiles = tiles_of(chunk);
+    int* tile_out = tiles;
+    // Spans are computed for several Gaussians before any is used, and four tiles are always written, because the
+    // numbers of rows and columns could not be predicted.
     constexpr int CAPACITY = 64;
-    int row_of[CAPACITY], rows_of[CAPACITY];
-    i4 from[CAPACITY], to[CAPACITY];
+    i4 first_tile[CAPACITY], counts_of_row[CAPACITY];
     int rank = chunk_start.data[chunk], row = 1, last_row = 0;
     wp::vec4 e;
     wp::vec2 f;
     while (rank < end || row <= last_row) {
         int groups = 0;
-        while (groups < CAPACITY) {
+        for (; groups < CAPACITY; ++groups, row += 4) {
             if (row > last_row) {
                 if (rank == end) break;
                 const int next = gaussian_from_rank.data[rank + AHEAD < end ? rank + AHEAD : end - 1];
@@ -102,20 +105,22 @@ _AHEAD = "    constexpr int AHEAD = 12;"
                 f = falloff.data[g];
                 tile_rows_of(e, f, row, last_row);
             }
-            tile_spans(e, f, row, from[groups], to[groups]);
-            row_of[groups] = row;
-            rows_of[groups++] = last_row - row < 4 ? last_row - row + 1 : 4;
-            row += 4;
+            i4 from, to;
+            tile_spans(e, f, row, from, to);
+            first_tile[groups] = (row + steps) * columns + from;
+            counts_of_row[groups] = row + steps <= last_row ? to - from + 1 : i4(0);
         }
         for (int i = 0; i < groups; ++i)
-            for (int k = 0; k < rows_of[i]; ++k) {
-                const int start = (row_of[i] + k) * columns;
-                for (int tile = start + from[i][k]; tile <= start + to[i][k]; ++tile) {
-                    *tile_out++ = tile;
-                    ++counts[tile];
+            for (int k = 0; k < 4; ++k) {
+                for (int done = 0; done == 0 || done < counts_of_row[i][k]; done += 4) {
+                    const i4 four = first_tile[i][k] + done + steps;
+                    __builtin_memcpy(tile_out + done, &four, sizeof(four));
                 }
+                tile_out += counts_of_row[i][k];
             }
     }
+    int* const counts = &count.data[(size_t)chunk * count.shape[1]];
+    for (const int* tile = tiles; tile < tile_out; ++tile) ++counts[*tile];
 """
     )
 )
@@ -150,8 +155,10 @@ def count_tiles_kernel(
     tile_from_pair_out: wp.array[wp.int32],
     count_out: wp.array2d[wp.int32],
 ):
-    """Write the tiles of the Gaussians of one chunk, from pair ``pair_start[chunk]`` on, and count the Gaussians in
-    each tile. Pairs are numbered by depth here."""
+    """Write the tiles of the Gaussians of one chunk, and count the Gaussians in each tile.
+
+    Pairs are numbered by depth here; ``tile_from_pair_out`` has four spare entries after the pairs of each chunk.
+    """
     count_tiles(
         wp.tid() + first_chunk,
         width,
@@ -168,10 +175,10 @@ def count_tiles_kernel(
 
 @wp.func_native(
     on_cpu(
-        _AHEAD
+        _TILES_OF_CHUNK
         + """
     int* const cursors = &cursor.data[(size_t)chunk * cursor.shape[1]];
-    const int* tile = &tile_from_pair.data[pair_start.data[chunk]];
+    const int* tile = tiles_of(chunk);
     const int start = chunk_start.data[chunk], end = chunk_start.data[chunk + 1];
     for (int rank = start; rank < end; ++rank) {
         __builtin_prefetch(slot_end.data + gaussian_from_rank.data[rank + AHEAD < end ? rank + AHEAD : end - 1]);
