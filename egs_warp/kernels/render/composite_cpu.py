@@ -58,6 +58,7 @@ _EACH_BLOCK = """
                 __builtin_prefetch(ellipse.data + next_id);
                 __builtin_prefetch(falloff.data + next_id);
                 __builtin_prefetch(colour_depth.data + next_id);
+                ALSO_PREFETCH
             }
             const wp::vec4 e = ellipse.data[id];
             const wp::vec2 f = falloff.data[id];
@@ -114,7 +115,7 @@ FORWARD = (
     for (int begin = start; begin < end && open != 0; begin += BATCH, refresh_open(pixels, 16 * CHANNELS)) {
         const int count = end - begin < BATCH ? end - begin : BATCH;
 """
-    + _EACH_BLOCK.replace("ALSO_NEAR", " & (c[3] <= channels[BOUND])").replace("BEFORE_BLOCKS", "")
+    + _EACH_BLOCK.replace("ALSO_NEAR", " & (c[3] <= channels[BOUND])").replace("BEFORE_BLOCKS", "").replace("ALSO_PREFETCH", "")
     + """
                 channels[PASSING] = stop ? -__builtin_elementwise_abs(before) : after;
                 channels[RED] += weight * c[0];
@@ -170,7 +171,9 @@ BACKWARD = (
     for (; begin < end && open != 0; begin += BATCH, refresh_open(pixels, 16 * CHANNELS)) {
         const int count = end - begin < BATCH ? end - begin : BATCH;
 """
-    + _EACH_BLOCK.replace("ALSO_NEAR", "").replace("BEFORE_BLOCKS", "f16 sums[10] = {};")
+    + _EACH_BLOCK.replace("ALSO_NEAR", "").replace("BEFORE_BLOCKS", "f16 sums[10] = {};").replace("ALSO_PREFETCH", """const float* const next_out = out_of(begin + k + BATCH);
+                __builtin_prefetch(next_out, 1);
+                __builtin_prefetch(next_out + 11, 1);""")
     + """
                 channels[PASSING] = stop ? none : after;
                 const f16 red = channels[RED], green = channels[GREEN], blue = channels[BLUE];
@@ -207,7 +210,9 @@ BACKWARD = (
             __builtin_memcpy(out + 8, &third_row, sizeof(third_row));
         }
     }
-    for (; begin < end; ++begin)
+    for (; begin < end; ++begin) {
+        if (begin + BATCH < end) __builtin_prefetch(out_of(begin + BATCH), 1);
         for (int q = 0; q < 12; ++q) out_of(begin)[q] = 0.0f;
+    }
 """
 )
