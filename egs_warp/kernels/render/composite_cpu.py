@@ -115,7 +115,9 @@ FORWARD = (
     for (int begin = start; begin < end && open != 0; begin += BATCH, refresh_open(pixels, 16 * CHANNELS)) {
         const int count = end - begin < BATCH ? end - begin : BATCH;
 """
-    + _EACH_BLOCK.replace("ALSO_NEAR", " & (c[3] <= channels[BOUND])").replace("BEFORE_BLOCKS", "").replace("ALSO_PREFETCH", "")
+    + _EACH_BLOCK.replace("ALSO_NEAR", " & (c[3] <= channels[BOUND])")
+    .replace("BEFORE_BLOCKS", "")
+    .replace("ALSO_PREFETCH", "")
     + """
                 channels[PASSING] = stop ? -__builtin_elementwise_abs(before) : after;
                 channels[RED] += weight * c[0];
@@ -171,9 +173,14 @@ BACKWARD = (
     for (; begin < end && open != 0; begin += BATCH, refresh_open(pixels, 16 * CHANNELS)) {
         const int count = end - begin < BATCH ? end - begin : BATCH;
 """
-    + _EACH_BLOCK.replace("ALSO_NEAR", "").replace("BEFORE_BLOCKS", "f16 sums[10] = {};").replace("ALSO_PREFETCH", """const float* const next_out = out_of(begin + k + BATCH);
+    + _EACH_BLOCK.replace("ALSO_NEAR", "")
+    .replace("BEFORE_BLOCKS", "f16 sums[10] = {};")
+    .replace(
+        "ALSO_PREFETCH",
+        """const float* const next_out = out_of(begin + k + BATCH);
                 __builtin_prefetch(next_out, 1);
-                __builtin_prefetch(next_out + 11, 1);""")
+                __builtin_prefetch(next_out + 11, 1);""",
+    )
     + """
                 channels[PASSING] = stop ? none : after;
                 const f16 red = channels[RED], green = channels[GREEN], blue = channels[BLUE];

@@ -1,7 +1,7 @@
-"""C++ source code of the screen covariances of sixteen Gaussians at a time, for the projection on a CPU and its backward
-pass.
+"""C++ source code of the screen covariances of sixteen Gaussians at a time, for a CPU, with the equations of
+``projection``.
 
-The equations are those of ``projection``.
+The projection and its backward pass use it.
 """
 
 from egs_warp.kernels.render.ellipse import LOW_PASS
@@ -76,5 +76,7 @@ SCREEN_COVARIANCES = (
         const f16 determinant = sharp_determinant + LOW_PASS * (sharp_xx + sharp_yy) + LOW_PASS * LOW_PASS;
 """
 )
-"""Head of a loop over the Gaussians ``first`` to ``last`` - 1, sixteen at a time from ``base`` on; the function that uses
-it closes the loop. Needs the arrays of the cloud and ``view``."""
+"""Head of a loop over the Gaussians ``first`` to ``last`` - 1, sixteen at a time from ``base`` on.
+
+The function that uses it closes the loop. It needs ``view`` and the arrays of the cloud.
+"""
