@@ -16,13 +16,15 @@ import numpy as np
 import warp as wp
 
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.render import render_gaussians
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import Background, composite
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.tiles import build_tile_lists
 
+# Not imported, because the older version has no list of them.
+_ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 _WORKER = "from render_versions import serve; serve()"
 
 
@@ -37,7 +39,7 @@ def compare_versions(cloud: GaussianCloud, camera: Camera, *, old: Path, repeats
     """
     with tempfile.TemporaryDirectory() as place:
         scene = Path(place) / "scene.pickle"
-        arrays = {name: getattr(cloud, name).numpy() for name in ARRAYS}
+        arrays = {name: getattr(cloud, name).numpy() for name in _ATTRIBUTES}
         scene.write_bytes(pickle.dumps({"arrays": arrays, "camera": vars(camera)}))
         here = Path(__file__).resolve().parent
         workers = {"old": _start(old, scene), "new": _start(here.parent, scene)}
