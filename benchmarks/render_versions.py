@@ -45,11 +45,11 @@ def compare_versions(cloud: GaussianCloud, camera: Camera, *, old: Path, repeats
         workers = {"old": _start(old, scene), "new": _start(here.parent, scene)}
         try:
             for worker in workers.values():
-                _ask(worker, "warm")
+                _send_request(worker, "warm")
             records = {name: [] for name in workers}
             for _ in range(repeats):
                 for name, worker in workers.items():
-                    records[name].append(json.loads(_ask(worker, "time")))
+                    records[name].append(json.loads(_send_request(worker, "time")))
         finally:
             for worker in workers.values():
                 worker.kill()
@@ -81,7 +81,7 @@ def _start(checkout: Path, scene: Path) -> subprocess.Popen[str]:
     )
 
 
-def _ask(worker: subprocess.Popen[str], request: str) -> str:
+def _send_request(worker: subprocess.Popen[str], request: str) -> str:
     assert worker.stdin is not None and worker.stdout is not None
     worker.stdin.write(request + "\n")
     worker.stdin.flush()

@@ -136,7 +136,7 @@ def count_tiles(
     tile_from_pair: wp.array[wp.int32],
     count: wp.array2d[wp.int32],
 ):
-    """See ``count_tiles_kernel``."""
+    """Write and count the tiles of one chunk of the depth order."""
     ...
 
 
@@ -204,7 +204,7 @@ def fill_tiles(
     gaussians: wp.array[wp.int32],
     slots: wp.array[wp.int32],
 ):
-    """See ``fill_tiles_kernel``."""
+    """Append the Gaussians of one chunk of the depth order to their tiles."""
     ...
 
 
