@@ -16,12 +16,13 @@ from egs_warp.locomotion.rollout import FRAME_RATE, BodyRun, RolloutResult
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.locomotion.world_rollout import roll_out_world, world_steps
+from egs_warp.motions.other_body import OtherBody
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.sequence import MotionRecord
 from egs_warp.motions.stance import RestDetector
 from egs_warp.motions.style import Style
-from egs_warp.motions.towards import OtherBody, script_among
+from egs_warp.motions.towards import script_among
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.end_state import EndCause
 from egs_warp.pipelines.prop import Prop
@@ -149,7 +150,9 @@ def simulate_world(
     def others(name: str) -> dict[str, OtherBody]:
         """Return the bodies other than the creature ``name``, with their current states."""
         return {
-            member.name: OtherBody(member.body.body, partial(_state_of, member, runs, index[member.name]))
+            member.name: OtherBody(
+                member.body.body, partial(_state_of, member, runs, index[member.name]), member.body.geometry
+            )
             for member in world.members
             if member.name != name
         }
@@ -171,9 +174,8 @@ def simulate_world(
             except UserError as error:
                 raise UserError(f"{name}: {error}") from error
             motion, kicks, front = performer.watch, performer.kicks, body.front.direction
-            runs.append(
-                BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame, front=front, kicks=kicks)
-            )
+            run = partial(BodyRun, front=front, kicks=kicks, has_others=len(world.members) > 1)
+            runs.append(run(body.stepper, body.geometry, body.start, motion, place=body.frame))
         else:
             motion = passive[name] = PassiveMotion(body)
             runs.append(BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame))
