@@ -6,6 +6,7 @@ Writes the film, the contact sheet, the report, and a trajectory and a report fo
 from __future__ import annotations
 
 import argparse
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,32 +18,54 @@ LENGTH, WIDTH, HEIGHT = 0.7, 0.5, 0.3
 RAMP_AT, RAMP_LENGTH, RAMP_HEIGHT = 1.4, 1.2, 0.25
 """Distance of the foot of the ramp, its length along the ground and its rise, m."""
 
+UP_AT = RAMP_AT + 0.4 * LENGTH
+"""Position of the middle of the box from which it is up the ramp, m: at most a tenth of it is on the ground."""
+
 
 def main(arguments: list[str] | None = None) -> egs.WorldReport:
     """Run the example and return the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/push"))
-    parser.add_argument("--density", type=float, default=60.0, help="density of the box, kg/m^3")
+    parser.add_argument("--seed", type=int, help="random position and density of the box, and heading of the pawn")
     parser.add_argument("--nodes", type=int, default=100, help="approximate number of cage nodes of the pawn")
     parser.add_argument("--frames", type=int, help="number of frames (default: until all bodies are at rest)")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
     egs.use_device(chosen.device)
-    built_in = egs.scene("pawn", device=chosen.device)
-    options = egs.CreatureOptions(nodes=chosen.nodes)
-    pawn = egs.make_creature(built_in.object, plane=built_in.plane, options=options)
-    box = egs.make_prop(box_cloud(chosen.device), up="z", height=HEIGHT, density=chosen.density)
-    world = egs.World(friction=0.5, solids=(ramp(),))
-    pusher = world.add(pawn, heading=0.0, name="pusher")
-    world.add(box, at=(0.85, 0.05), name="box")
-    # At this place, the whole box is on the ramp.
-    motions = {pusher: f"push box to {RAMP_AT + 0.5 * LENGTH},0"}
+    world, motions = start(chosen.seed, nodes=chosen.nodes, device=chosen.device)
     run = egs.simulate(world, motions, frames=chosen.frames)
     report = egs.write_world(run, chosen.out, size=chosen.size, overwrite=True)
     print(report.summary())
     print(f"wrote {report.film}, sheet.png, report.json and a folder for each body to {chosen.out}")
     return report
+
+
+def start(seed: int | None, *, nodes: int = 100, device: str = "cpu") -> tuple[egs.World, dict[str, str]]:
+    """Return the world and the motion of the pusher.
+
+    Args:
+        seed: of the random position of the box (up to 0.05 m along and 0.1 m across the ramp), its heading (up to 10
+            degrees) and its density (30 to 90 kg/m^3), and the heading of the pawn (up to 20 degrees); None gives the
+            start without deviations.
+        nodes: approximate number of cage nodes of the pawn.
+        device: Warp device.
+    """
+    random = np.zeros(5) if seed is None else np.random.default_rng(seed).uniform(-1.0, 1.0, 5)
+    box = egs.make_prop(box_cloud(device), up="z", height=HEIGHT, density=60.0 + 30.0 * float(random[0]))
+    world = egs.World(friction=0.5, solids=(ramp(),))
+    world.add(pawn(nodes, device), heading=20.0 * float(random[1]), name="pusher")
+    at = (0.9 + 0.05 * float(random[2]), 0.1 * float(random[3]))
+    world.add(box, at=at, heading=10.0 * float(random[4]), name="box")
+    # At this place, the whole box is on the ramp.
+    return world, {"pusher": f"push box to {RAMP_AT + 0.5 * LENGTH:g},0"}
+
+
+@cache
+def pawn(nodes: int, device: str) -> egs.Creature:
+    """Return the pawn as a creature."""
+    scene = egs.scene("pawn", device=device)
+    return egs.make_creature(scene.object, plane=scene.plane, options=egs.CreatureOptions(nodes=nodes))
 
 
 def ramp() -> egs.Solid:
