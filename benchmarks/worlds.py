@@ -12,7 +12,7 @@ Aims on a CPU: ``apart_cost`` (two bodies that never meet take at most 1.1 times
 ``cpu_two_realtime`` (a frame of two creatures with 250 nodes each takes at most 33 ms, even if they touch),
 ``sleeping_cost`` (two creatures among 30 sleeping props take at most 1.5 times as long as two alone).
 
-With ``--starts``, worlds of the named examples are simulated from ``--runs`` random starts instead. Aims: ``chess`` (the
+With ``--starts``, the named examples are simulated from ``--runs`` random starts instead. Aims: ``chess`` (the
 struck piece lies at the end of 18 of 20 runs), ``push`` (the box is up the ramp at the end of 16 of 20 runs).
 """
 
