@@ -134,7 +134,7 @@ class Stance:
 class JudgedOutcome:
     """Base of measured results that contain a judgement of targets beyond those of ``MotionOutcome``."""
 
-    missed: tuple[str, ...]
+    failures: tuple[str, ...]
     """Description of each missed target, for the report."""
 
 

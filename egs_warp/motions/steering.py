@@ -72,7 +72,7 @@ class Policy(Protocol):
         """Return the names of the bodies that need not be avoided at present."""
         ...
 
-    def missed(self, view: View) -> tuple[str, ...]:
+    def failures(self, view: View) -> tuple[str, ...]:
         """Return a description of each target that was missed, for the report."""
         ...
 
@@ -157,7 +157,7 @@ class SteeringOutcome(JudgedOutcome):
     ahead: float
     left: float
     """Displacement forward and to the left."""
-    least_clearance: float
+    min_clearance: float
     """Minimum of the distance to another body minus the distance at which both touch."""
 
 
@@ -187,7 +187,7 @@ class Steered:
         self._view = View(0.0, self._centre(stance.standing), 0.0)
         self._start = self._view.position
         self._radius = radius_of(stance.ground.local(stance.standing))
-        self._least = np.inf
+        self._minimum = np.inf
         self.neighbours.update(0.0)
         first = policy.goal(self._view)
         self._plan = SteeringPlan(
@@ -216,8 +216,8 @@ class Steered:
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> SteeringOutcome:
         """Measure the displacement and the clearance, and judge the target."""
         ahead, left = (self._view.position - self._start) / self.body.height
-        least = self._least / self.body.height
-        return SteeringOutcome(self._policy.missed(self._view), float(ahead), float(left), float(least))
+        minimum = self._minimum / self.body.height
+        return SteeringOutcome(self._policy.failures(self._view), float(ahead), float(left), float(minimum))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
@@ -227,7 +227,7 @@ class Steered:
         self.neighbours.update(view.time)
         for name, touching in self.neighbours.touching.items():
             distance = float(np.linalg.norm(self.neighbours.motion(name)[0] - view.position))
-            self._least = min(self._least, distance - touching)
+            self._minimum = min(self._minimum, distance - touching)
         self._is_over = self._is_over or self._policy.is_over(view)
         self._drive.command = Drive() if self._is_over else self._command(view)
         return self._drive.objectives(state, report, dt)

@@ -21,7 +21,7 @@ _STEER_GAIN = 2.5
 """Heading change of a pushing body relative to its sideways distance from the line through the pushed body to its goal,
 radians per body height; the contact point moves to the side to which the pushed body has to turn."""
 _MAX_STEER = np.radians(35.0)
-_LOST = 0.5
+_MAX_OFFSET = 0.5
 """Sideways distance from this line, relative to the distance at which the bodies touch, from which a push begins again
 behind the body."""
 
@@ -46,7 +46,7 @@ class WalkToPoint:
         """Return no names."""
         return ()
 
-    def missed(self, view: View) -> tuple[str, ...]:
+    def failures(self, view: View) -> tuple[str, ...]:
         """Describe the distance to the point, if it is too large."""
         left = float(np.linalg.norm(self.point - view.position)) / self.stance.body.height
         return (f"{left:.2f} body heights from the target",) if left > _TOLERANCE else ()
@@ -75,7 +75,7 @@ class WalkToBody:
         """Return the name of the other body."""
         return (self._name,)
 
-    def missed(self, view: View) -> tuple[str, ...]:
+    def failures(self, view: View) -> tuple[str, ...]:
         """Describe the remaining distance, if it is too large."""
         left = self._left(view) / self._stance.body.height
         return (f"{left:.2f} body heights too far from {self._name}",) if left > _TOLERANCE else ()
@@ -106,7 +106,7 @@ class FollowBody:
         """Return the name of the other body."""
         return (self._name,)
 
-    def missed(self, view: View) -> tuple[str, ...]:
+    def failures(self, view: View) -> tuple[str, ...]:
         """Describe the remaining distance, if it is more than a body height."""
         left = self._left(view) / self._stance.body.height
         return (f"{left:.2f} body heights behind {self._name}",) if left > 1.0 else ()
@@ -119,7 +119,7 @@ class AvoidBody:
         """Create the target; ``gap`` in metres is the distance between the bodies below which the body walks away."""
         self._stance, self._other, self._name = stance, other, name
         self._gap, self._seconds = gap, seconds
-        self._least = np.inf
+        self._minimum = np.inf
 
     def _apart(self, view: View) -> float:
         centre, touching = self._other.place(self._stance)
@@ -127,7 +127,7 @@ class AvoidBody:
 
     def goal(self, view: View) -> np.ndarray | None:
         """Return a point away from the other body; None if it is far."""
-        self._least = min(self._least, self._apart(view))
+        self._minimum = min(self._minimum, self._apart(view))
         if self._apart(view) > self._gap:
             return None
         away = view.position - self._other.centre(self._stance)
@@ -141,9 +141,9 @@ class AvoidBody:
         """Return no names."""
         return ()
 
-    def missed(self, view: View) -> tuple[str, ...]:
+    def failures(self, view: View) -> tuple[str, ...]:
         """Return a text if the other body came too close."""
-        return (f"{self._name} touched it",) if self._least < 0.0 else ()
+        return (f"{self._name} touched it",) if self._minimum < 0.0 else ()
 
 
 class PushTo:
@@ -164,7 +164,7 @@ class PushTo:
         behind = centre - (touching + _RUN_UP * height) * along
         across = np.array([-along[1], along[0]])
         lateral, depth = float((view.position - centre) @ across), float((view.position - centre) @ along)
-        if self._is_pushing and (abs(lateral) > _LOST * touching or depth > 0.0):
+        if self._is_pushing and (abs(lateral) > _MAX_OFFSET * touching or depth > 0.0):
             self._is_pushing = False
         if not self._is_pushing and np.linalg.norm(view.position - behind) < 1.5 * _ARRIVED * height:
             self._is_pushing = True
@@ -189,7 +189,7 @@ class PushTo:
         """Return the name of the body while it is pushed."""
         return (self._name,) if self._is_pushing else ()
 
-    def missed(self, view: View) -> tuple[str, ...]:
+    def failures(self, view: View) -> tuple[str, ...]:
         """Describe the distance of the body from its place, if it is too large."""
         left = self._line()[2] / self._stance.body.height
         return (f"{self._name} is {left:.2f} body heights from its target",) if left > _TOLERANCE else ()

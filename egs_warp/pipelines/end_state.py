@@ -88,7 +88,7 @@ class EndCause:
         if isinstance(also_reached, ActOutcome):
             missed += [gesture.text for gesture in also_reached.gestures if gesture.is_missed]
         if isinstance(also_reached, JudgedOutcome) and entry.motion.is_at_rest:
-            missed += also_reached.missed
+            missed += also_reached.failures
         slip = getattr(also_reached, "slip", 0.0)
         if self.base is SupportKind.FEET and slip > MAX_SLIP:
             missed.append(f"feet slide by {100.0 * slip:.0f} % of a stride")

@@ -64,9 +64,9 @@ def test_a_push_is_judged_by_the_place_of_the_box() -> None:
     box = Box()
     push = PushTo(box.stance, box.other, "box", np.array([2.5, 0.0]))
     assert not push.is_over(view(0.0, 0.0))
-    assert push.missed(view(0.0, 0.0)) == ("box is 1.00 body heights from its target",)
+    assert push.failures(view(0.0, 0.0)) == ("box is 1.00 body heights from its target",)
     box.at = np.array([2.49, 0.0])
-    assert push.is_over(view(0.0, 0.0)) and not push.missed(view(0.0, 0.0))
+    assert push.is_over(view(0.0, 0.0)) and not push.failures(view(0.0, 0.0))
 
 
 def test_walks_aim_at_a_body_that_moves() -> None:
@@ -79,15 +79,15 @@ def test_walks_aim_at_a_body_that_moves() -> None:
     near = view(0.0, 3.0 - box.touching - 0.1)
     assert walk.is_over(near) and not walk.is_over(view(0.0, 0.0))
     assert follow.goal(near) is None and not follow.is_over(near) and follow.is_over(view(0.0, 0.0, 2.0))
-    assert walk.missed(view(0.0, 1.0)) and not walk.missed(near)
-    assert follow.missed(view(0.0, 0.0)) and not follow.missed(near)
+    assert walk.failures(view(0.0, 1.0)) and not walk.failures(near)
+    assert follow.failures(view(0.0, 0.0)) and not follow.failures(near)
 
 
 def test_a_body_walks_away_only_from_a_near_one() -> None:
     box = Box()
     avoid = AvoidBody(box.stance, box.other, "box", 0.5, 2.0)
-    assert avoid.goal(view(0.0, 0.0)) is None and not avoid.missed(view(0.0, 0.0))
+    assert avoid.goal(view(0.0, 0.0)) is None and not avoid.failures(view(0.0, 0.0))
     away = avoid.goal(view(1.5, box.touching + 0.2))
     assert away is not None and away[1] > 1.0
     avoid.goal(view(1.5, 0.5 * box.touching))
-    assert avoid.missed(view(0.0, 0.0)) == ("box touched it",)
+    assert avoid.failures(view(0.0, 0.0)) == ("box touched it",)

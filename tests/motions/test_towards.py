@@ -8,8 +8,8 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.motions.other_body import OtherBody
-from egs_warp.motions.towards import check_motion, script_among
 from egs_warp.motions.sequence import BodyMotion
+from egs_warp.motions.towards import check_motion, script_among
 from egs_warp.pipelines.creature import initial_stance
 from tests.support.creatures import coarse_pawn
 from tests.support.props import box_body
@@ -51,7 +51,7 @@ def test_a_kick_out_of_reach_is_refused_with_the_distances() -> None:
     creature = coarse_pawn()
     king = OtherBody(creature.body, lambda: creature.moved((2.0, 0.0, 0.0)).start, creature.geometry)
     script = script_among("kick king", {"king": king}, initial_stance(creature))
-    with pytest.raises(UserError, match="king is 2.00 body heights away; walk or jump to a distance between"):
+    with pytest.raises(UserError, match=r"king is 2\.00 body heights away; walk or jump to a distance between"):
         script.check(initial_stance(creature))
 
 
