@@ -58,14 +58,15 @@ class WalkToBody:
     def __init__(self, stance: Stance, other: OtherBody, name: str, gap: float) -> None:
         """Create the target; ``gap`` is the distance in metres between the bodies at which the walk ends."""
         self._stance, self._other, self._name, self._gap = stance, other, name, gap
+        self._touching = other.place(stance)[1]
 
     def goal(self, view: View) -> np.ndarray:
         """Return the position of the other body."""
         return self._other.centre(self._stance)
 
     def _left(self, view: View) -> float:
-        centre, touching = self._other.place(self._stance)
-        return float(np.linalg.norm(centre - view.position)) - touching - self._gap
+        centre = self._other.centre(self._stance)
+        return float(np.linalg.norm(centre - view.position)) - self._touching - self._gap
 
     def is_over(self, view: View) -> bool:
         """Return True at the gap from the other body."""
@@ -87,11 +88,11 @@ class FollowBody:
     def __init__(self, stance: Stance, other: OtherBody, name: str, gap: float, seconds: float) -> None:
         """Create the target; ``gap`` in metres is the distance between the bodies."""
         self._stance, self._other, self._name = stance, other, name
-        self._gap, self._seconds = gap, seconds
+        self._gap, self._seconds, self._touching = gap, seconds, other.place(stance)[1]
 
     def _left(self, view: View) -> float:
-        centre, touching = self._other.place(self._stance)
-        return float(np.linalg.norm(centre - view.position)) - touching - self._gap
+        centre = self._other.centre(self._stance)
+        return float(np.linalg.norm(centre - view.position)) - self._touching - self._gap
 
     def goal(self, view: View) -> np.ndarray | None:
         """Return the position of the other body; None if it is close."""
@@ -118,12 +119,12 @@ class AvoidBody:
     def __init__(self, stance: Stance, other: OtherBody, name: str, gap: float, seconds: float) -> None:
         """Create the target; ``gap`` in metres is the distance between the bodies below which the body walks away."""
         self._stance, self._other, self._name = stance, other, name
-        self._gap, self._seconds = gap, seconds
+        self._gap, self._seconds, self._touching = gap, seconds, other.place(stance)[1]
         self._minimum = np.inf
 
     def _apart(self, view: View) -> float:
-        centre, touching = self._other.place(self._stance)
-        return float(np.linalg.norm(centre - view.position)) - touching
+        centre = self._other.centre(self._stance)
+        return float(np.linalg.norm(centre - view.position)) - self._touching
 
     def goal(self, view: View) -> np.ndarray | None:
         """Return a point away from the other body; None if it is far."""

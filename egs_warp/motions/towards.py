@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from egs_warp.errors import UserError, did_you_mean
+from egs_warp.fem.body import GRAVITY
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.kick import Kick
 from egs_warp.motions.other_body import OtherBody, radius_of
@@ -34,6 +35,9 @@ _NO_TURN_TIME = 0.1
 _TIME_FACTOR = 2.0
 """Ratio of the time limit to the limit that the motion would have at the start of the run. It exceeds 1 because the
 other body may move away."""
+_MIN_SPEED, _EXTRA_TIME = 0.04, 12.0
+"""Speed in sqrt(g H), a third of the commanded one, and time in seconds to turn, from which the time limit of a steered
+walk is computed."""
 _MAX_PLACE = 1e4
 """Largest coordinate of a target of ``push``, m."""
 
@@ -158,8 +162,7 @@ def _values(kind: str, parameters: tuple[Value, ...], words: list[str], where: s
 
 def _time_limit(piece: _Piece, other: OtherBody, stance: Stance) -> float:
     """Return the time limit of a motion in seconds, for a body of 1 m."""
-    centre, _ = other.place(stance)
-    height = stance.body.height
+    centre = other.centre(stance)
     if piece.kind in ("follow", "avoid"):
         return piece.values["seconds"] + 5.0
     if piece.kind in ("jump to", "kick"):
@@ -171,8 +174,13 @@ def _time_limit(piece: _Piece, other: OtherBody, stance: Stance) -> float:
         length = float(np.linalg.norm(centre))
         if piece.place is not None:
             length += float(np.linalg.norm(_in_frame(piece.place, stance) - centre))
-        (base,) = script(f"walk to {min(length / height, MAX_TARGET):.6f},0").requests
+        return _walk_limit(length / stance.body.height)
     return _TIME_FACTOR * frames_of_request(base) / 60.0
+
+
+def _walk_limit(length: float) -> float:
+    """Return the time limit of a steered walk of ``length`` body heights in seconds, for a body of 1 m."""
+    return _EXTRA_TIME + length / (_MIN_SPEED * GRAVITY**0.5)
 
 
 def _in_frame(place: np.ndarray, stance: Stance) -> np.ndarray:
@@ -190,7 +198,7 @@ def _among(
         replace(
             request,
             begin=partial(_begin_walk, request, others),
-            seconds=_TIME_FACTOR * frames_of_request(request) / 60.0,
+            seconds=_walk_limit(float(np.hypot(request.asked["ahead"], request.asked["left"]))),
         )
         if request.name == "walk to" and not request.layers
         else request
