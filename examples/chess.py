@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import egs_warp as egs
 
@@ -17,6 +18,8 @@ SQUARE = 0.4
 """Side of a square, in heights of the pawn: three squares are a jump that the pawn can make."""
 
 
+PIECE_HEIGHT, SLENDERNESS = 0.8, 0.6
+"""Height of the other piece, m, and the ratio of its width to that of a pawn of this height."""
 BASE_FRICTION = 0.4
 """Coulomb coefficient of lacquered wood on a lacquered board."""
 
@@ -34,7 +37,7 @@ def main(arguments: list[str] | None = None) -> egs.WorldReport:
     egs.use_device(chosen.device)
     world, motions = start(chosen.seed, nodes=chosen.nodes, device=chosen.device)
     run = egs.simulate(world, motions, frames=chosen.frames)
-    report = egs.write_world(run, chosen.out, size=chosen.size, overwrite=True)
+    report = egs.write_world(run, chosen.out, size=chosen.size, view_from=(0.35, -1.0, 0.45), overwrite=True)
     print(report.summary())
     print(f"wrote {report.film}, sheet.png, report.json and a folder for each body to {chosen.out}")
     return report
@@ -51,13 +54,29 @@ def start(seed: int | None, *, nodes: int = 100, device: str = "cpu") -> tuple[e
     """
     random = np.zeros(4) if seed is None else np.random.default_rng(seed).uniform(-1.0, 1.0, 4)
     aside = 0.1 * SQUARE * random[:2]
-    piece = egs.make_prop(
-        pawn_scene(device).object, plane=pawn_scene(device).plane, density=65.0 + 25.0 * float(random[2]), height=0.6
-    )
+    density = 65.0 + 25.0 * float(random[2])
+    piece = egs.make_prop(slender(pawn_scene(device).object), up="z", density=density, height=PIECE_HEIGHT)
     world = egs.World(friction=BASE_FRICTION)
     world.add(pawn(nodes, device), heading=20.0 * float(random[3]), name="attacker")
     world.add(piece, at=(1.6 * SQUARE + float(aside[0]), 0.8 * SQUARE + float(aside[1])), name="target")
     return world, {"attacker": f"kick target distance={3.0 * SQUARE:g}"}
+
+
+def slender(cloud: egs.GaussianCloud) -> egs.GaussianCloud:
+    """Return the capture of a pawn as a slender piece: its width multiplied by ``SLENDERNESS``, in grey."""
+    factors = np.array([SLENDERNESS, SLENDERNESS, 1.0])
+    rotations = Rotation.from_quat(cloud.rotations.numpy().astype(float), scalar_first=True).as_matrix()
+    # Covariance factor F R S of the deformed Gaussians, decomposed into a rotation and scales.
+    axes, scales, _ = np.linalg.svd(factors[:, None] * rotations * np.exp(cloud.log_scales.numpy())[:, None, :])
+    axes[:, :, 2] *= np.linalg.det(axes)[:, None]
+    return egs.GaussianCloud.from_numpy(
+        cloud.means.numpy() * factors,
+        Rotation.from_matrix(axes).as_quat(scalar_first=True),
+        np.log(scales),
+        cloud.opacity_logits.numpy(),
+        cloud.sh.numpy().mean(axis=2, keepdims=True).repeat(3, axis=2),
+        device=str(cloud.means.device),
+    )
 
 
 @cache

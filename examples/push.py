@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> egs.WorldReport:
     egs.use_device(chosen.device)
     world, motions = start(chosen.seed, nodes=chosen.nodes, device=chosen.device)
     run = egs.simulate(world, motions, frames=chosen.frames)
-    report = egs.write_world(run, chosen.out, size=chosen.size, overwrite=True)
+    report = egs.write_world(run, chosen.out, size=chosen.size, view_from=(0.35, -1.0, 0.45), overwrite=True)
     print(report.summary())
     print(f"wrote {report.film}, sheet.png, report.json and a folder for each body to {chosen.out}")
     return report

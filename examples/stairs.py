@@ -34,7 +34,7 @@ def main(arguments: list[str] | None = None) -> egs.WorldReport:
     world = egs.World(friction=0.8, solids=tuple(step(number) for number in range(STEPS)))
     climber = world.add(pawn, heading=0.0, name="climber")
     run = egs.simulate(world, {climber: f"hop {DEPTH} height=0.3 x{STEPS}"}, frames=chosen.frames)
-    report = egs.write_world(run, chosen.out, size=chosen.size, overwrite=True)
+    report = egs.write_world(run, chosen.out, size=chosen.size, view_from=(0.35, -1.0, 0.45), overwrite=True)
     print(report.summary())
     print(f"wrote {report.film}, sheet.png, report.json and a folder for the pawn to {chosen.out}")
     return report

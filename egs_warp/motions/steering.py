@@ -68,8 +68,8 @@ class Policy(Protocol):
         """Return True if the motion has ended."""
         ...
 
-    def ignored(self) -> Sequence[str]:
-        """Return the names of the bodies that need not be avoided at present."""
+    def ignored(self) -> Sequence[str] | None:
+        """Return the names of the bodies that need not be avoided at present; None to walk straight to the goal."""
         ...
 
     def failures(self, view: View) -> tuple[str, ...]:
@@ -243,6 +243,8 @@ class Steered:
             return Drive()
         height, unit = self.body.height, self.body.time_unit
         ignored = self._policy.ignored()
+        if ignored is None:
+            return steering_command(view.heading, goal - view.position)
         discs = [
             (*self.neighbours.motion(name), touching + _MARGIN * height)
             for name, touching in self.neighbours.touching.items()

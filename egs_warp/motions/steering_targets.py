@@ -186,9 +186,9 @@ class PushTo:
         """Return True if the body is at its place."""
         return self._line()[2] < _ARRIVED * self._stance.body.height
 
-    def ignored(self) -> Sequence[str]:
-        """Return the name of the body while it is pushed."""
-        return (self._name,) if self._is_pushing else ()
+    def ignored(self) -> Sequence[str] | None:
+        """Return None while it pushes: it walks straight, also if there is a ramp under the body."""
+        return None if self._is_pushing else ()
 
     def failures(self, view: View) -> tuple[str, ...]:
         """Describe the distance of the body from its place, if it is too large."""
