@@ -36,8 +36,7 @@ from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.simulation import simulate
 from egs_warp.pipelines.world import World
 from egs_warp.pipelines.world_run import WorldRun
-from examples import example
-from harness import Row, Table, flags, report
+from harness import Row, Table, example, flags, report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -168,7 +167,7 @@ def measure_starts(options: argparse.Namespace) -> None:
 def has_succeeded(module: ModuleType, run: WorldRun) -> str:
     """Return "yes" if the piece of ``chess`` lies, or the box of ``push`` is up the ramp, else "no"."""
     prop = run.results[1]
-    body, positions = prop.body.body, prop.trajectory.positions
+    body, positions = prop.body.body, prop.simulation.trajectory.positions
     if hasattr(module, "UP_AT"):
         return "yes" if body.centre_of_mass(positions[-1])[0] > module.UP_AT else "no"
     turn = body.best_fit_rotation(positions[-1]) @ body.best_fit_rotation(positions[0]).T

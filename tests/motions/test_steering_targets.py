@@ -75,7 +75,9 @@ def test_walks_aim_at_a_body_that_moves() -> None:
     follow = FollowBody(box.stance, box.other, "box", 0.1, 2.0)
     box.at = np.array([0.0, 3.0])
     for policy in (walk, follow):
-        np.testing.assert_allclose(policy.goal(view(0.0, 0.0)), box.at, atol=1e-9)
+        goal = policy.goal(view(0.0, 0.0))
+        assert goal is not None
+        np.testing.assert_allclose(goal, box.at, atol=1e-9)
     near = view(0.0, 3.0 - box.touching - 0.1)
     assert walk.is_over(near) and not walk.is_over(view(0.0, 0.0))
     assert follow.goal(near) is None and not follow.is_over(near) and follow.is_over(view(0.0, 0.0, 2.0))
