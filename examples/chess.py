@@ -18,7 +18,7 @@ SQUARE = 0.4
 """Side of a square, in heights of the pawn: three squares are a jump that the pawn can make."""
 
 
-PIECE_HEIGHT, SLENDERNESS = 0.8, 0.6
+PIECE_HEIGHT, SLENDERNESS = 0.7, 0.6
 """Height of the other piece, m, and the ratio of its width to that of a pawn of this height."""
 BASE_FRICTION = 0.4
 """Coulomb coefficient of lacquered wood on a lacquered board."""

@@ -17,7 +17,7 @@ from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
 from egs_warp.motions.other_body import OtherBody
 from egs_warp.motions.sequence import JudgedOutcome, Stance
 
-_OVERLAP = 0.85
+_OVERLAP = 0.8
 """Distance from the path to the middle of the other body, relative to the distance at which its top and the base of the
 jumper would just touch. A path through the middle carries the body along and the jumper lands on it."""
 _TOP = 0.6
