@@ -123,23 +123,34 @@ def free_direction(
     """
     arm = goal - position
     left = float(np.linalg.norm(arm))
-    directions = np.exp(1j * (np.arctan2(arm[1], arm[0]) + _ANGLES))
+    angles = np.arctan2(arm[1], arm[0]) + _ANGLES
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     costs = np.abs(_ANGLES) + _LEFT_COST * (_ANGLES > 0.0)
-    for index, direction in enumerate(np.stack([directions.real, directions.imag], axis=1)):
-        for centre, velocity, apart in discs:
-            relative, offset = speed * direction - velocity, centre - position
-            time = float(offset @ relative) / max(float(relative @ relative), 1e-12)
-            time = min(max(time, 0.0), horizon, left / speed)
-            nearest = float(np.linalg.norm(offset - time * relative))
-            # A body that is already too close counts only as far as it comes closer.
-            required = min(apart, float(np.linalg.norm(offset)))
-            costs[index] += _DEFICIT_COST * max(required - nearest, 0.0) / height
-        for share in (0.25, 0.5, 0.75, 1.0):
-            if blocked(position + share * min(_LOOKAHEAD * height, left) * direction):
-                costs[index] += _DEFICIT_COST * (1.25 - share) * _LOOKAHEAD
-                break
-    best = directions[int(np.argmin(costs))]
-    return np.array([best.real, best.imag])
+    for centre, velocity, apart in discs:
+        relative, offset = speed * directions - velocity, centre - position
+        times = relative @ offset / np.maximum((relative**2).sum(axis=1), 1e-12)
+        times = np.clip(times, 0.0, min(horizon, left / speed))
+        nearest = np.linalg.norm(offset - times[:, None] * relative, axis=1)
+        # A body that is already too close counts only as far as it comes closer.
+        required = min(apart, float(np.linalg.norm(offset)))
+        costs += _DEFICIT_COST * np.maximum(required - nearest, 0.0) / height
+    # The cost of an obstacle is only needed for directions that could be the best.
+    for index in np.argsort(costs, kind="stable"):
+        obstacle = _obstacle_cost(position, directions[index], min(_LOOKAHEAD * height, left), blocked)
+        costs[index] += obstacle
+        if obstacle == 0.0:
+            break
+    return directions[int(np.argmin(costs))]
+
+
+def _obstacle_cost(
+    position: np.ndarray, direction: np.ndarray, length: float, blocked: Callable[[np.ndarray], bool]
+) -> float:
+    """Return the cost of walking ``length`` m in ``direction`` (2,); the larger, the nearer an obstacle is."""
+    for share in (0.25, 0.5, 0.75, 1.0):
+        if blocked(position + share * length * direction):
+            return _DEFICIT_COST * (1.25 - share) * _LOOKAHEAD
+    return 0.0
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,9 @@ _RUN_UP = 0.12
 _STEER_GAIN = 2.5
 """Heading change of a pushing body relative to its sideways distance from the line through the pushed body to its goal,
 radians per body height; the contact point moves to the side to which the pushed body has to turn."""
+_BEYOND = 0.6
+"""Distance beyond the target, in body heights, at which the pushing body aims, so that its direction changes little near
+the target."""
 _MAX_STEER = np.radians(35.0)
 _MAX_OFFSET = 0.5
 """Sideways distance from this line, relative to the distance at which the bodies touch, from which a push begins again
@@ -153,12 +156,14 @@ class PushTo:
     def __init__(self, stance: Stance, other: OtherBody, name: str, target: np.ndarray) -> None:
         """Create the target; ``target`` (2,) m is the place for the other body, ground frame of ``stance``."""
         self._stance, self._other, self._name, self._target = stance, other, name, target
+        arm = target - other.centre(stance)
+        self._direction = arm / max(float(np.linalg.norm(arm)), 1e-9)
         self._radius = radius_of(stance.ground.local(stance.standing))
         self._is_pushing = False
 
     def goal(self, view: View) -> np.ndarray:
         """Return the point to walk to: first behind the body, then through it."""
-        centre, along, _ = self._line()
+        centre, along = self._line()
         height = self._stance.body.height
         extent = float(((centre - self._stance.ground.local(self._other.points())[:, :2]) @ along).max())
         touching = self._radius + extent
@@ -175,16 +180,16 @@ class PushTo:
         angle = float(np.clip(-_STEER_GAIN * lateral / height, -_MAX_STEER, _MAX_STEER))
         return view.position + height * (np.cos(angle) * along + np.sin(angle) * across)
 
-    def _line(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return the position of the body, the unit vector to the target and the remaining distance."""
+    def _line(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the position (2,) m of the body and the unit vector (2,) of the line along which it is pushed."""
         centre = self._other.centre(self._stance)
-        arm = self._target - centre
-        left = float(np.linalg.norm(arm))
-        return centre, arm / max(left, 1e-9), left
+        arm = self._target + _BEYOND * self._stance.body.height * self._direction - centre
+        return centre, arm / max(float(np.linalg.norm(arm)), 1e-9)
 
     def is_over(self, view: View) -> bool:
-        """Return True if the body is at its place."""
-        return self._line()[2] < _ARRIVED * self._stance.body.height
+        """Return True if the body has been pushed as far as its place."""
+        left = float((self._target - self._other.centre(self._stance)) @ self._direction)
+        return left < _ARRIVED * self._stance.body.height
 
     def ignored(self) -> Sequence[str] | None:
         """Return None while it pushes: it walks straight, also if there is a ramp under the body."""
@@ -192,5 +197,6 @@ class PushTo:
 
     def failures(self, view: View) -> tuple[str, ...]:
         """Describe the distance of the body from its place, if it is too large."""
-        left = self._line()[2] / self._stance.body.height
+        off = self._target - self._other.centre(self._stance)
+        left = float(np.linalg.norm(off)) / self._stance.body.height
         return (f"{self._name} is {left:.2f} body heights from its target",) if left > _TOLERANCE else ()
