@@ -21,7 +21,7 @@ _STEER_GAIN = 2.5
 """Heading change of a pushing body relative to its sideways distance from the line through the pushed body to its goal,
 radians per body height; the contact point moves to the side to which the pushed body has to turn."""
 _BEYOND = 0.6
-"""Distance beyond the target, in body heights, at which the pushing body aims, so that its direction changes little near
+"""Distance beyond the target, in body heights, at which the pushing body aims: its direction then changes little near
 the target."""
 _MAX_STEER = np.radians(35.0)
 _MAX_OFFSET = 0.5
