@@ -20,7 +20,7 @@ _RUN_UP = 0.12
 _STEER_GAIN = 2.5
 """Heading change of a pushing body relative to its sideways distance from the line through the pushed body to its goal,
 radians per body height; the contact point moves to the side to which the pushed body has to turn."""
-_BEYOND = 0.6
+_AIM_DISTANCE = 0.6
 """Distance beyond the target, in body heights, at which the pushing body aims: its direction then changes little near
 the target."""
 _MAX_STEER = np.radians(35.0)
@@ -183,7 +183,7 @@ class PushTo:
     def _line(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the position (2,) m of the body and the unit vector (2,) of the line along which it is pushed."""
         centre = self._other.centre(self._stance)
-        arm = self._target + _BEYOND * self._stance.body.height * self._direction - centre
+        arm = self._target + _AIM_DISTANCE * self._stance.body.height * self._direction - centre
         return centre, arm / max(float(np.linalg.norm(arm)), 1e-9)
 
     def is_over(self, view: View) -> bool:
