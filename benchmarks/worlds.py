@@ -1,7 +1,7 @@
 """Time of a step of a world, as a function of the numbers of bodies and of contacts between them.
 
 python benchmarks/worlds.py [--quick] [--bodies N ...] [--nodes N] [--frames N] [--json PATH] [--plot PATH]
-python benchmarks/worlds.py --starts chess push [--runs N] [--json PATH]
+python benchmarks/worlds.py --starts chess push [--runs N] [--workers N] [--json PATH]
 
 Copies of the pawn jump together for ``--frames`` frames, in three arrangements: far apart, in a row in which neighbours
 touch, and two of them far apart among 30 sleeping props. For each world, the median, mean and largest time of a step
@@ -36,7 +36,7 @@ from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.simulation import simulate
 from egs_warp.pipelines.world import World
 from egs_warp.pipelines.world_run import WorldRun
-from harness import Row, Table, example, flags, report
+from harness import Row, Table, example, flags, report, rows_of, workers_flag
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -108,6 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--nodes", type=int, default=175, help="requested number of nodes of each cage (default 175)")
     parser.add_argument("--frames", type=int, default=45, help="frames of each world (default 45)")
     parser.add_argument("--starts", nargs="+", choices=tuple(MIN_SUCCESS), help="examples to run from random starts")
+    workers_flag(parser)
     parser.add_argument("--runs", type=int, default=20, help="random starts of each example (default 20)")
     options = parser.parse_args(arguments)
     if options.starts:
@@ -142,19 +143,11 @@ def measure_starts(options: argparse.Namespace) -> None:
     """Simulate examples from random starts and count the runs that succeed."""
     rows: list[Row] = []
     table = Table(example="<10", seed="d", success="<8", creature="<18", prop="<60", seconds=".1f")
-    for name in options.starts:
-        module = example(name)
-        for seed in range(1, (2 if options.quick else options.runs) + 1):
-            started = time.process_time()
-            world, motions = module.start(seed)
-            run = simulate(world, motions, frames=FRAMES[name], get_up=False)
-            mover, prop = run.results
-            report_of_mover = report_of_body(mover)
-            row: Row = {"example": name, "seed": seed, "success": has_succeeded(module, run)}
-            row |= {"creature": report_of_mover.state.value, "prop": displacement_text(prop)}
-            row["seconds"] = time.process_time() - started
-            rows.append(row)
-            table.row(*row.values())
+    seeds = range(1, (2 if options.quick else options.runs) + 1)
+    tasks = [(name, seed) for name in options.starts for seed in seeds]
+    for row in rows_of(run_from_start, tasks, options.workers):
+        rows.append(row)
+        table.row(*row.values())
     aims: dict[str, bool | None] = {}
     for name in options.starts:
         chosen = [row for row in rows if row["example"] == name]
@@ -162,6 +155,18 @@ def measure_starts(options: argparse.Namespace) -> None:
         print(f"{name}: {count} of {len(chosen)} succeed; the creature falls in {fell}")
         aims[name] = count >= MIN_SUCCESS[name] * len(chosen)
     report(options, rows, aims=aims)
+
+
+def run_from_start(name: str, seed: int) -> Row:
+    """Simulate an example from the random start ``seed``."""
+    started, module = time.process_time(), example(name)
+    world, motions = module.start(seed)
+    run = simulate(world, motions, frames=FRAMES[name], get_up=False)
+    mover, prop = run.results
+    row: Row = {"example": name, "seed": seed, "success": has_succeeded(module, run)}
+    row |= {"creature": report_of_body(mover).state.value, "prop": displacement_text(prop)}
+    row["seconds"] = time.process_time() - started
+    return row
 
 
 def has_succeeded(module: ModuleType, run: WorldRun) -> str:
