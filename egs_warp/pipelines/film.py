@@ -204,15 +204,19 @@ def split_deformer(performance: BodyResult, *, in_scene: bool = False) -> Deform
     """
     body, simulation = performance.body, performance.simulation
     trajectory, cloud, mesh = simulation.trajectory, body.cloud, body.mesh
-    if not in_scene and trajectory.ground_coefficients.size == 0:
-        # Hide the haze of the captured ground, which would be visible below a jumping creature.
-        cloud = hidden_below(cloud, GROUND, margin=_BELOW_GROUND * trajectory.height)
+    # Hide the haze of the captured ground, which would be visible below a jumping creature.
+    hides_ground = not in_scene and trajectory.ground_coefficients.size == 0
+    margin = _BELOW_GROUND * trajectory.height
+    if hides_ground:
+        cloud = hidden_below(cloud, GROUND, margin=margin)
     if len(mesh.tets) == 1:
         return Deformer(cloud, embed_gaussians(cloud, mesh))
     keys = simulation.frames[:: max(1, len(simulation.frames) // SPLIT_KEY_FRAMES)]
     embedding = embed_gaussians(body.cloud, mesh)
     split = split_for_motion(cloud, embedding, [trajectory.positions[step] for step in keys])
-    return Deformer(split.cloud, split.embedding)
+    # Parts of Gaussians that cross the ground may be below it.
+    parts = hidden_below(split.cloud, GROUND, margin=margin) if hides_ground else split.cloud
+    return Deformer(parts, split.embedding)
 
 
 def drawn_frames(
