@@ -132,7 +132,7 @@ class BodyInfo:
             f" ({', '.join(f'{count} {kind.value}' for kind, count in kinds.items())})"
         )
         motions = self.motions()
-        width = max(map(len, motions)) + 1
+        width = max(map(len, motions))
         for name, why in motions.items():
             needs = MOTIONS[name].file
             can = f"yes, with {needs}" if needs is not None else "yes"
