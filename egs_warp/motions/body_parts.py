@@ -69,7 +69,7 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
         above_necks = [nodes_of(_above(shape, branch, neck), _MIN_MASS, 1.0) for neck in _necks(branch)]
         whole = nodes_of(_own_sections(branch), _MIN_MASS, _MAX_BRANCH_MASS)
         nodes = next((nodes for nodes in above_necks if nodes is not None), whole)
-        if nodes is not None and not _is_raised_beside_the_top(nodes, heights, node_mass):
+        if nodes is not None and not _is_raised_arm(nodes, heights, node_mass):
             heads.append((float(node_mass[nodes].sum()), branch, nodes))
     _, head_branch, head = max(heads, key=lambda entry: entry[0], default=(0.0, None, None))
     branches = [
@@ -80,7 +80,7 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
     return ShapeParts(head, tuple(nodes for nodes in branches if nodes is not None))
 
 
-def _is_raised_beside_the_top(part: np.ndarray, heights: np.ndarray, node_mass: np.ndarray) -> bool:
+def _is_raised_arm(part: np.ndarray, heights: np.ndarray, node_mass: np.ndarray) -> bool:
     """True if the rest of the body ends higher than a ``part`` (k,) of its nodes, and its top is heavier."""
     rest = np.setdiff1d(np.arange(len(heights)), part)
     depth = _TOP_DEPTH * float(np.ptp(heights))
