@@ -17,7 +17,7 @@ from pathlib import Path
 
 from annotated_scenes import DrawnScene, read_drawn
 from clicking import clicked
-from egs_warp.commands.object_flag import read_object
+from egs_warp.pipelines.object_selection import read_object
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.inpainting.picture import before_and_after

@@ -1,15 +1,26 @@
-"""``egs-warp animate WORLD.yaml``: simulate and film the bodies of a world file."""
+"""``egs-warp animate WORLD.yaml``: simulate and film the bodies of a world."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 from egs_warp.commands.camera_flags import shot_of
 from egs_warp.commands.flags import parse_direction
 from egs_warp.commands.scene_flags import print_above_bars, print_note, start_device
 from egs_warp.errors import UserError
 
+if TYPE_CHECKING:
+    from egs_warp.io.run_folder import RunFolder
+    from egs_warp.pipelines.scene_obstacles import SceneObstacles
+    from egs_warp.pipelines.scene_script import SceneProgress
+    from egs_warp.pipelines.surroundings import Surroundings
+    from egs_warp.pipelines.world_file import WorldScript
+
+WorldReader: TypeAlias = "Callable[[SceneProgress], WorldScript]"
+"""Function that creates a world."""
 WORLD_ENDINGS = (".yaml", ".yml")
 """Endings of the names of world files."""
 _FLAGS = (
@@ -24,23 +35,46 @@ def is_world(capture: str) -> bool:
     return Path(capture).suffix.lower() in WORLD_ENDINGS
 
 
+def check_world_flags(args: argparse.Namespace, problem: str, *, also: tuple[str, ...] = ()) -> None:
+    """Raise ``UserError`` with the ``problem`` for flags that apply neither to a world nor are in ``also``."""
+    for action in args.parser._actions:
+        known = action.dest in _FLAGS or action.dest in also
+        if action.dest in vars(args) and not known and getattr(args, action.dest) != action.default:
+            flag = action.option_strings[0] if action.option_strings else action.dest
+            raise UserError(f"{flag}: {problem}")
+
+
 def animate_world(args: argparse.Namespace) -> bool:
     """Run ``egs-warp animate`` for a world file; return True if the exit status must report a failure. The caller has
     checked the output folder."""
+    from egs_warp.pipelines.world_file import read_world
+
+    problem = "is for a single capture; a world file describes its bodies; leave it out"
+    check_world_flags(args, problem, also=("save_collision_mesh",))
+    return run_world(
+        args,
+        lambda progress: read_world(
+            args.capture,
+            device=args.device,
+            progress=lambda name: print_note(f"preparing {name}"),
+            scene_progress=progress,
+        ),
+    )
+
+
+def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
+    """Create a world with ``read``, simulate and film it; return True if the exit status must report a failure."""
     from egs_warp.io.run_folder import run_folder
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.motions.style import read_style
     from egs_warp.pipelines.animate import PREVIEW_SIZE
     from egs_warp.pipelines.animate_world import COMMAND, write_world
     from egs_warp.pipelines.progress import simulation_bar
+    from egs_warp.pipelines.scene_pictures import write_scene_parts
+    from egs_warp.pipelines.scene_script import SceneProgress
     from egs_warp.pipelines.simulated_run import check_frames
-    from egs_warp.pipelines.world_file import read_world
     from egs_warp.pipelines.world_run import simulate_world
 
-    for action in args.parser._actions:
-        if action.dest in vars(args) and action.dest not in _FLAGS and getattr(args, action.dest) != action.default:
-            flag = action.option_strings[0] if action.option_strings else action.dest
-            raise UserError(f"{flag}: is for a single capture; a world file describes its bodies; leave it out")
     shot, background = shot_of(args)
     if background is not None:
         raise UserError("--background: a world has a colour or transparent as its background; give one of these")
@@ -50,7 +84,15 @@ def animate_world(args: argparse.Namespace) -> bool:
     ffmpeg_program()
     start_device(args.device)
     with run_folder(args.out, command=COMMAND, overwrite=args.overwrite) as folder:
-        scripted = read_world(args.capture, device=args.device, progress=lambda name: print_note(f"preparing {name}"))
+        # The parts are written first, so that a later error does not lose minutes of work.
+        progress = SceneProgress(
+            print_note,
+            lambda prepared: write_scene_parts(prepared, folder),
+            lambda obstacles, surroundings: _write_obstacles(args, folder, obstacles, surroundings),
+        )
+        scripted = read(progress)
+        if args.save_collision_mesh is not None and scripted.parts is None:
+            raise UserError("--save-collision-mesh: the world has no scene, so it has no obstacles; leave it out")
         for note in scripted.notes:
             print_note(note)
         with simulation_bar() as show_frames:
@@ -78,3 +120,17 @@ def animate_world(args: argparse.Namespace) -> bool:
     print_above_bars(report.summary())
     print_above_bars(f"film: {args.out / str(report.film)} (sheet.png and report.json are beside it)")
     return report.state.is_failure
+
+
+def _write_obstacles(
+    args: argparse.Namespace, folder: RunFolder, obstacles: SceneObstacles, surroundings: Surroundings
+) -> None:
+    """Write the picture of the obstacles of a scene, and the file of ``--save-collision-mesh``."""
+    from egs_warp.io.video import write_png
+    from egs_warp.pipelines.scene_collision import write_collision_mesh
+    from egs_warp.pipelines.scene_pictures import OBSTACLE_PICTURE, obstacle_picture
+
+    write_png(folder.file(OBSTACLE_PICTURE), obstacle_picture(obstacles, surroundings))
+    if args.save_collision_mesh is not None:
+        write_collision_mesh(args.save_collision_mesh, obstacles, surroundings.frame)
+        print_note(f"collision mesh: {args.save_collision_mesh}")

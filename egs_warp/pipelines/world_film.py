@@ -148,22 +148,24 @@ def draw_world_film(
     motion = WorldMotion.from_run(run)
     steps = np.arange(len(motion.time)) if shot.fps == FRAME_RATE else nearest_steps(motion.time, shot.fps)
     camera = resized(world_camera(run, size, view_from), *(shot.size or (size, size)))
-    cameras = shot.cameras(camera, motion, steps)
+    cameras = shot.cameras(camera, motion, steps, in_scene=run.world.surroundings is not None)
     obstacles = _obstacles(run, motion.positions.reshape(-1, 3))
-    deformers = {name: split_deformer(result) for name, result in run.bodies.items()}
+    scene = None if run.world.surroundings is None else run.world.surroundings.cloud
+    deformers = {name: split_deformer(result, in_scene=scene is not None) for name, result in run.bodies.items()}
     deformer = JointDeformer(tuple(deformers.values()), fixed=None if obstacles is None else obstacles.cloud)
     simulations = [result.simulation for result in run.results]
     poses = ([each.trajectory.positions[each.frames[step]] for each in simulations] for step in steps)
     filmed = Filmed(
         np.concatenate([path_of(each.trajectory) for each in simulations]),
         max(each.trajectory.height for each in simulations),
+        is_flat=run.world.ground is None,
     )
     deform = deformer.deform
     if obstacles is not None and shadow:
         count = deformer.rest.count - obstacles.cloud.count
         shadows = ObstacleShadows(obstacles, count, blur_radius=shadow_blur_radius(deformer.rest), height=filmed.height)
         deform = partial(_deform_with_shadows, deformer, shadows)
-    frames = rendered_frames(deform, deformer.rest, poses, filmed, cameras, shot, shadow=shadow)
+    frames = rendered_frames(deform, deformer.rest, poses, filmed, cameras, shot, scene=scene, shadow=shadow)
     path, _ = encode_film(frames, folder, name, cameras[0], shot, motion.time[steps], quiet=quiet)
     return WorldFilm(path.name, deformers, camera)
 
@@ -194,6 +196,10 @@ def _clearest_view(run: WorldRun) -> np.ndarray:
     first, second = np.triu_indices(len(simulations), 1)
     between, reach = paths[first] - paths[second], np.array(radii)[first] + np.array(radii)[second]
     angles = 2.0 * np.pi * (np.arange(_VIEWS) + 0.5) / _VIEWS
+    surroundings = run.world.surroundings
+    if surroundings is not None and surroundings.views is not None:
+        # A capture looks best from where it was photographed.
+        angles = np.arctan2(surroundings.views[:, 1], surroundings.views[:, 0])
     best, best_score = angles[0], -np.inf
     for angle in angles:
         towards, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])

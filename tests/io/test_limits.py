@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from egs_warp.commands.object_flag import read_mask
+from egs_warp.pipelines.object_selection import read_mask
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from egs_warp.assets import scene
-from egs_warp.commands.object_flag import read_mask, read_object
+from egs_warp.pipelines.object_selection import read_mask, read_object
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
@@ -180,9 +180,9 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     assert clicked is not None
     np.testing.assert_allclose(np.linalg.norm(clicked - [0.0, 0.0, 0.5]), 0.5, atol=0.04)
     for text, given, view, message in (
-        ("nothing.png", posed, None, "--object nothing.png: neither a file nor numbers"),
-        ("1,2,3,4", posed, None, "--object 1,2,3,4: 4 numbers"),
-        ("1e300,2,3", posed, None, "--object 1e300,2,3: further than 1e.12 units from the origin"),
+        ("nothing.png", posed, None, "object nothing.png: neither a file nor numbers"),
+        ("1,2,3,4", posed, None, "object 1,2,3,4: 4 numbers"),
+        ("1e300,2,3", posed, None, "object 1e300,2,3: further than 1e.12 units from the origin"),
         ("1,2,3,1,5,6", posed, None, "the box is flat"),
         ("5,5", [], None, "a pixel needs cameras"),
         ("5,5", posed, None, "3 cameras; choose one with --view"),

@@ -20,7 +20,7 @@ import numpy as np
 
 from egs_warp.commands.animate import add_parser
 from egs_warp.commands.config import with_config
-from egs_warp.commands.object_flag import read_mask
+from egs_warp.pipelines.object_selection import read_mask
 from egs_warp.contact.terrain import read_terrain
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
