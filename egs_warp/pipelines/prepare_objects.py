@@ -12,9 +12,10 @@ from scipy.spatial import KDTree
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.frames import Direction
+from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
+from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
 from egs_warp.segmentation.clicks import Click
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -112,8 +113,17 @@ def prepare_objects(
         progress(name)
         try:
             notes += [f"{name}: {note}" for note in _shared(cloud, spec, owners, list(scenes))]
-            remaining = _in_remaining_scene(spec, cloud, rest, origins)
-            scene = prepare(rest, remaining, up=up, plane=(planes or {}).get(name))
+            remaining, plane = _in_remaining_scene(spec, cloud, rest, origins), (planes or {}).get(name)
+            try:
+                scene = prepare(rest, remaining, up=up, plane=plane)
+            except UserError:
+                if plane is not None or rest is cloud:
+                    raise
+                # The new floor on top of this object may outweigh the surface on which it stands.
+                plane = locate_plane(
+                    cloud, spec, cameras=cameras, up=None if up is None else direction_of(up, "up")
+                ).plane
+                scene = prepare(rest, remaining, up=up, plane=plane)
         except UserError as error:
             raise UserError(f"{name}: {error}") from error
         segmentation = scene.located.segmentation

@@ -47,7 +47,8 @@ def write_collision_mesh(path: Path | str, obstacles: SceneObstacles, frame: Bod
     """
     parts = [TriangleMesh(GROUND_NAME, *_ground_mesh(obstacles))]
     for number, solid in enumerate(obstacles.solids, start=1):
-        vertices, faces = solid_mesh(solid)
+        bounds = box_between(obstacles.low, obstacles.high)
+        vertices, faces = solid_mesh(Solid((*solid.faces, *bounds.faces)))
         parts.append(TriangleMesh(f"solid-{number}", vertices, faces))
     write_triangle_glb(
         path, [TriangleMesh(each.name, frame.capture_points(each.vertices), each.faces) for each in parts]
@@ -77,9 +78,10 @@ def read_collision_mesh(path: Path | str) -> tuple[Solid, ...]:
 def solid_mesh(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
     """Return the vertices (V, 3) and triangles (F, 3), wound outwards, of a bounded solid."""
     rows = np.array([[*face.normal, face.offset] for face in solid.faces])
-    vertices = HalfspaceIntersection(rows, _inner_point(rows)).intersections
-    hull = ConvexHull(vertices)
-    return vertices, _outward(vertices, hull.simplices)
+    corners = HalfspaceIntersection(rows, _inner_point(rows)).intersections
+    hull = ConvexHull(corners)
+    used, faces = np.unique(hull.simplices, return_inverse=True)
+    return corners[used], _outward(corners[used], faces.reshape(-1, 3))
 
 
 def _inner_point(rows: np.ndarray) -> np.ndarray:

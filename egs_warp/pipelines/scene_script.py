@@ -98,7 +98,6 @@ def read_scene_parts(
     device: str | None = None,
     solids: Sequence[Solid] = (),
     progress: SceneProgress | None = None,
-    error_of: Callable[[str, UserError], UserError] = lambda name, error: error,
 ) -> SceneParts:
     """Read a scene, cut its objects out and make a world of them.
 
@@ -109,10 +108,9 @@ def read_scene_parts(
         device: Warp device.
         solids: Further obstacles in the frame of the world, m.
         progress: Functions that are called in the course of the preparation.
-        error_of: Converts an error on an object, given its name.
 
     Raises:
-        UserError: A file or a value is invalid, or a stage failed.
+        UserError: A file or a value is invalid, or a stage failed. A message on an object begins with its name.
     """
     progress = progress or SceneProgress()
     capture = read_capture(request.capture, device=device)
@@ -126,33 +124,30 @@ def read_scene_parts(
         try:
             specs[name], plane, bodies[name] = _specified(selected, capture, posed, request)
         except UserError as error:
-            raise error_of(name, UserError(f"{name}: {error}")) from error
+            raise UserError(f"{name}: {error}") from error
         if plane is not None:
             planes[name] = plane
     given = None if request.collision_mesh is None else read_collision_mesh(request.collision_mesh)
     prepare: Preparer = partial(_prepared, posed=posed, options=request.scene_options)
-    try:
-        prepared = prepare_objects(
-            capture,
-            specs,
-            up=request.up,
-            planes=planes,
-            prepare=prepare,
-            progress=lambda name: progress.show_stage(f"cutting {name} out of the scene"),
-        )
-        progress.show_prepared(prepared)
-        made = make_scene_world(
-            prepared,
-            bodies,
-            cameras=cameras,
-            options=replace(request.options, solids=given),
-            solids=solids,
-            progress=lambda name: progress.show_stage(f"preparing {name}"),
-            show_obstacles=progress.show_obstacles,
-        )
-    except UserError as error:
-        name = str(error).partition(":")[0]
-        raise (error_of(name, error) if name in specs else error) from error
+    prepared = prepare_objects(
+        capture,
+        specs,
+        cameras=cameras,
+        up=request.up,
+        planes=planes,
+        prepare=prepare,
+        progress=lambda name: progress.show_stage(f"cutting {name} out of the scene"),
+    )
+    progress.show_prepared(prepared)
+    made = make_scene_world(
+        prepared,
+        bodies,
+        cameras=cameras,
+        options=replace(request.options, solids=given),
+        solids=solids,
+        progress=lambda name: progress.show_stage(f"preparing {name}"),
+        show_obstacles=progress.show_obstacles,
+    )
     notes = (*capture.notes, *(poses.messages if poses is not None else ()), *made.notes)
     return SceneParts(capture, cameras, prepared, replace(made, notes=notes))
 

@@ -80,7 +80,7 @@ def read_world(
     check_schema(path, tree, node, SCHEMA)
     entries = tree["bodies"]
     for index, entry in enumerate(entries):
-        _check_keys(path, tree, entry, line_of(node, ["bodies", index]))
+        _check_keys(f"{path}, line {line_of(node, ['bodies', index])}", index, tree, entry)
     for key in _SCENE_KEYS:
         if key in tree and "scene" not in tree:
             line = line_of(node, [key])
@@ -98,13 +98,15 @@ def read_world(
     notes: list[str] = []
     if "scene" in tree:
         where = {name: f"{path}, line {line_of(node, ['bodies', index])}" for index, name in names.items()}
-        parts = read_scene_parts(
-            _scene_request(path.parent, tree, {name: entries[index] for index, name in names.items()}),
-            device=device,
-            solids=solids,
-            progress=scene_progress or SceneProgress(progress),
-            error_of=lambda name, error: UserError(f"{where[name]}: {error}"),
-        )
+        request = _scene_request(path.parent, tree, {name: entries[index] for index, name in names.items()})
+        try:
+            parts = read_scene_parts(
+                request, device=device, solids=solids, progress=scene_progress or SceneProgress(progress)
+            )
+        except UserError as error:
+            # Errors on an object begin with its name.
+            line = where.get(str(error).partition(":")[0], f"{path}, line {line_of(node, ['scene'])}")
+            raise UserError(f"{line}: {error}") from error
         world = parts.scene_world.world
         notes += parts.scene_world.notes
     else:
@@ -260,28 +262,28 @@ def _solid(entry: Mapping[str, Any]) -> Solid:
     return Solid(tuple(Plane.from_coefficients(*face) for face in entry["solid"]))
 
 
-def _check_keys(path: Path, tree: Mapping[str, Any], entry: Mapping[str, Any], line: int) -> None:
+def _check_keys(where: str, index: int, tree: Mapping[str, Any], entry: Mapping[str, Any]) -> None:
     if ("object" in entry) == ("capture" in entry):
         given = "both capture and object are given" if "object" in entry else "capture is missing"
         advice = "give the name of a capture, or object for an object of the scene"
-        raise UserError(f"{path}, line {line}: {given}; {advice}")
+        raise UserError(f"{where}: bodies.{index + 1}: {given}; {advice}")
     if "object" in entry:
         if "scene" not in tree:
-            raise UserError(f"{path}, line {line}: object is for a scene; add scene: capture to the file")
+            raise UserError(f"{where}: object is for a scene; add scene: capture to the file")
         for key in _PLACE_KEYS:
             if key in entry:
                 raise UserError(
-                    f"{path}, line {line}: {key} is for a body with a capture; an object has its captured place and"
+                    f"{where}: {key} is for a body with a capture; an object has its captured place and"
                     " size; leave it out"
                 )
     elif "view" in entry:
-        raise UserError(f"{path}, line {line}: view is for an object of a scene; leave it out")
+        raise UserError(f"{where}: view is for an object of a scene; leave it out")
     is_prop = entry.get("prop", False)
     for key in _CREATURE_KEYS if is_prop else _PROP_KEYS:
         if key in entry:
             advice = "leave it out, or leave out prop: true" if is_prop else "add prop: true, or leave it out"
             kind = "a creature" if is_prop else "a prop"
-            raise UserError(f"{path}, line {line}: {key} is for {kind}; {advice}")
+            raise UserError(f"{where}: {key} is for {kind}; {advice}")
 
 
 def _make_body(folder: Path, entry: Mapping[str, Any], device: str | None) -> Creature | Prop:

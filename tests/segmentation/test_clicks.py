@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egs_warp.pipelines.object_selection import read_object
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
@@ -15,6 +14,7 @@ from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.io import read_cameras
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
+from egs_warp.pipelines.object_selection import read_object
 from egs_warp.segmentation.above_plane import SceneAbovePlane, clicked_parts, detached_parts
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.object_mask import segment

@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from egs_warp.assets import scene
-from egs_warp.pipelines.object_selection import read_mask, read_object
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
@@ -17,6 +16,7 @@ from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
+from egs_warp.pipelines.object_selection import read_mask, read_object
 from egs_warp.segmentation import floor_remnants
 from egs_warp.segmentation import object_mask as module
 from egs_warp.segmentation.object_mask import segment
