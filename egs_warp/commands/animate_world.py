@@ -47,18 +47,13 @@ def check_world_flags(args: argparse.Namespace, problem: str, *, also: tuple[str
 def animate_world(args: argparse.Namespace) -> bool:
     """Run ``egs-warp animate`` for a world file; return True if the exit status must report a failure. The caller has
     checked the output folder."""
-    from egs_warp.pipelines.world_file import read_world
+    from egs_warp.pipelines.world_file import read_world_file
 
     problem = "is for a single capture; a world file describes its bodies; leave it out"
     check_world_flags(args, problem, also=("save_collision_mesh",))
     return run_world(
         args,
-        lambda progress: read_world(
-            args.capture,
-            device=args.device,
-            progress=lambda name: print_note(f"preparing {name}"),
-            scene_progress=progress,
-        ),
+        lambda progress: read_world_file(Path(args.capture), progress, device=args.device),
     )
 
 

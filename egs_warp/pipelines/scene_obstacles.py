@@ -253,7 +253,7 @@ def _boxes(
     The top of a box below an object is moved to the plane of the object if it is less than a cell away.
     """
     spacing, z = lattice.spacing, lattice.axis(2)
-    above = z > heights[..., None] + spacing
+    above = z > heights[..., None] + _BAND * spacing
     free = np.zeros(above.shape, bool)
     for name, points in objects.items():
         near = np.zeros(above.shape, bool)

@@ -32,7 +32,8 @@ _OVERLAY = 0.55
 
 
 def write_scene_parts(prepared: PreparedObjects, run: RunFolder) -> None:
-    """Write ``background.ply`` and, in a folder for each object, ``object.ply``, ``plane.json`` and pictures.
+    """Write the remaining scene, ``background.ply``, and in a folder for each object ``object.ply``, ``plane.json`` and
+    pictures.
 
     Args:
         prepared: The objects and the remaining scene.
@@ -42,7 +43,7 @@ def write_scene_parts(prepared: PreparedObjects, run: RunFolder) -> None:
     for name, scene in prepared.scenes.items():
         place = run.folder(name)
         place.mkdir(exist_ok=True)
-        scene.write(place)
+        scene.write(place, has_background=False)
         centre, size = scene.located.centre, scene.located.size
         cameras = picture_cameras(scene.plane, centre, size)
         whole = concatenate(*_alike(scene.object, scene.background_with_hole))
@@ -60,7 +61,7 @@ def obstacle_picture(obstacles: SceneObstacles, surroundings: Surroundings) -> n
     """Return (H, W, 3) uint8, views of the scene without the objects, with ground (green), what is below its edge (red)
     and solids (grey) drawn over it."""
     scene = surroundings.cloud
-    reach = 0.3 * float(np.linalg.norm((obstacles.high - obstacles.low)[:2]))
+    reach = 0.42 * float(np.linalg.norm((obstacles.high - obstacles.low)[:2]))
     middle = 0.5 * (obstacles.low + obstacles.high) * [1.0, 1.0, 0.0]
     cameras = ring_cameras(GROUND, middle, reach, count=4, elevations=(20.0, 45.0), size=_SIDE)
     solids = make_obstacles(obstacles.solids, obstacles.low, obstacles.high, device=str(scene.device))

@@ -62,20 +62,22 @@ def read_world(
     *,
     device: str | None = None,
     progress: Callable[[str], object] = lambda stage: None,
-    scene_progress: SceneProgress | None = None,
 ) -> WorldScript:
     """Read a world file and create its bodies.
 
     Args:
         path: YAML file; names of captures are relative to its folder.
         device: Warp device; None uses Warp's current device.
-        progress: Called with the name of each body before it is created; not for copies of an earlier body.
-        scene_progress: Functions that are called while a scene is prepared; None uses only ``progress``.
+        progress: Called with a description of each stage as it starts; not for copies of an earlier body.
 
     Raises:
         UserError: The file is invalid, or a body cannot be created or placed; the message names the line.
     """
-    path = Path(path)
+    return read_world_file(Path(path), SceneProgress(progress), device=device)
+
+
+def read_world_file(path: Path, progress: SceneProgress, *, device: str | None = None) -> WorldScript:
+    """Read a world file like ``read_world``; the functions of ``progress`` are called in the course of it."""
     tree, node = read_yaml(path)
     check_schema(path, tree, node, SCHEMA)
     entries = tree["bodies"]
@@ -100,9 +102,7 @@ def read_world(
         where = {name: f"{path}, line {line_of(node, ['bodies', index])}" for index, name in names.items()}
         request = _scene_request(path.parent, tree, {name: entries[index] for index, name in names.items()})
         try:
-            parts = read_scene_parts(
-                request, device=device, solids=solids, progress=scene_progress or SceneProgress(progress)
-            )
+            parts = read_scene_parts(request, device=device, solids=solids, progress=progress)
         except UserError as error:
             # Errors on an object begin with its name.
             line = where.get(str(error).partition(":")[0], f"{path}, line {line_of(node, ['scene'])}")
@@ -119,7 +119,7 @@ def read_world(
             name = names[index]
         else:
             with _at_line(path, node, index):
-                name = _add_body(world, path.parent, entry, bodies, notes, device, progress)
+                name = _add_body(world, path.parent, entry, bodies, notes, device, progress.show_stage)
         if "motion" in entry:
             motions[name] = entry["motion"]
         if "push" in entry:
@@ -143,14 +143,14 @@ def _add_body(
     bodies: dict[str, Creature | Prop],
     notes: list[str],
     device: str | None,
-    progress: Callable[[str], object],
+    show_stage: Callable[[str], object],
 ) -> str:
     """Add the body of an entry with a capture to ``world`` and return its name. ``bodies`` contains the bodies made so
     far, which copies share; notes on a new body are added to ``notes``."""
     key = repr([entry.get(name) for name in _MAKER_KEYS])
     name = entry.get("name", Path(entry["capture"]).stem)
     if key not in bodies:
-        progress(name)
+        show_stage(f"preparing {name}")
         bodies[key] = _make_body(folder, entry, device)
         notes += [f"{name}: {note}" for note in bodies[key].notes]
     name = _unused_name(world, name) if "name" not in entry else name

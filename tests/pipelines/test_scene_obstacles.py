@@ -1,0 +1,92 @@
+"""Obstacles of a scene: ground with an edge, boxes beside it, and free space in a room."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from egs_warp.contact.terrain import surface_above
+from egs_warp.geometry.body_frame import GROUND, BodyFrame
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.pipelines.locate_plane import LocatedPlane
+from egs_warp.pipelines.prepare_objects import PreparedObjects
+from egs_warp.pipelines.prepare_scene import PreparedScene
+from egs_warp.pipelines.scene_obstacles import SceneObstacles, measure_obstacles
+from egs_warp.segmentation.object_spec import Segmentation
+
+FRAME = BodyFrame(np.eye(3), np.zeros(3), 1.0)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def blocks(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> GaussianCloud:
+    """Return opaque round Gaussians 0.04 apart on the faces of boxes, given by their corners."""
+    points = []
+    for low, high in boxes:
+        axes = [np.arange(a, b + 0.02, 0.04) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        ends = np.array([[axis[0] for axis in axes], [axis[-1] for axis in axes]])
+        points.append(grid[(grid == ends[0]).any(axis=1) | (grid == ends[1]).any(axis=1)])
+    means = np.concatenate(points)
+    count = len(means)
+    quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+    scales = np.full((count, 3), np.log(0.02))
+    return GaussianCloud.from_numpy(
+        means, quaternions, scales, np.full(count, 4.0), np.zeros((count, 1, 3)), device="cpu"
+    )
+
+
+OBJECT = blocks(((-0.2, -0.2, 0.02), (0.2, 0.2, 1.0)))
+TABLE = ((-1.2, -1.2, -0.04), (1.2, 1.2, 0.0))
+BOX = ((0.6, -0.4, 0.0), (1.0, 0.4, 0.5))
+
+
+@cache
+def obstacles_of(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> SceneObstacles:
+    none = np.zeros(1, bool)
+    located = LocatedPlane(GROUND, None, np.array([0.0, 0.0, 0.5]), 1.0, Segmentation(none, none, none, 1.0), ())
+    background = blocks(*boxes)
+    scene = PreparedScene(OBJECT, background, background, GROUND, None, located, ())
+    return measure_obstacles(PreparedObjects({"thing": scene}, {"thing": GROUND}, ()), FRAME, height=1.0)
+
+
+def test_the_ground_of_a_table_ends_at_its_edge() -> None:
+    found = obstacles_of(TABLE, BOX)
+    assert found.ground is not None and found.notes[0].startswith("the ground ends beside the objects")
+    on_table = np.array([[0.0, 0.0, 0.0], [1.1, 1.1, 0.0], [-1.1, 0.3, 0.0]])
+    np.testing.assert_allclose(found.ground.ground_height(on_table), 0.0, atol=1e-9)
+    beyond = np.array([[1.5, 0.0, 0.0], [0.0, -1.5, 0.0], [2.4, 2.4, 0.0], [9.0, 0.0, 0.0]])
+    np.testing.assert_allclose(found.ground.ground_height(beyond), -1.0, atol=1e-9)
+
+
+def test_what_stands_beside_the_object_is_solid_and_the_object_is_free() -> None:
+    """Tops and sides of the box are found to a cell of 0.04 m, down to the table, and nothing else is solid."""
+    found = obstacles_of(TABLE, BOX)
+    assert 1 <= len(found.solids) <= 3
+
+    def top(x: float, y: float) -> float:
+        return surface_above(found.solids, np.array([x, y, 0.0]), UP)
+
+    for x, y in ((0.8, 0.0), (0.66, -0.34), (0.94, 0.34)):
+        assert abs(top(x, y) - 0.5) <= 0.06
+    for x, y in ((0.0, 0.0), (0.5, 0.0), (0.8, 0.5), (1.1, 0.0), (-0.8, -0.8)):
+        assert top(x, y) == -np.inf
+    inside = np.array([0.8, 0.0, 0.02])
+    assert any(all(face.heights(inside) < 0.0 for face in solid.faces) for solid in found.solids)
+
+
+def test_a_room_is_not_filled() -> None:
+    """Walls and a ceiling enclose the object in every direction; the space between them stays free."""
+    low, high = (-2.0, -2.0, -0.04), (2.0, 2.0, 1.3)
+    found = obstacles_of((low, high))
+    for point in ((0.8, 0.0, 0.5), (-1.5, 1.5, 0.9), (0.0, 0.0, 0.5)):
+        at = np.array(point)
+        assert not any(all(face.heights(at) < 0.0 for face in solid.faces) for solid in found.solids), point
+    wall = np.array([2.0, 0.0, 0.5])
+    assert any(all(face.heights(wall) < 0.01 for face in solid.faces) for solid in found.solids)
+
+
+def test_level_ground_without_an_edge_is_a_plane() -> None:
+    found = obstacles_of(((-3.2, -3.2, -0.04), (3.2, 3.2, 0.0)))
+    assert found.ground is None and found.solids == ()
+    assert found.notes == ("obstacles: none; nothing stands beside the objects",)
