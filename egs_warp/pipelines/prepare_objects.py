@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import Direction, direction_of
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
@@ -32,6 +32,9 @@ _NOTED = 0.01
 """Fraction of shared Gaussians above which a note is written."""
 _PICKED_NEIGHBOURS = 8
 """Number of neighbours that decide if new floor belongs to a picked object."""
+_MIN_TOP, _ON_TOP = 0.05, 0.08
+"""Minimum height above the plane of an object, and maximum distance from the object, of new floor that belongs to it,
+relative to the size of the object."""
 _MAX_TILT, _MAX_OFFSET = 3.0, 0.03
 """Maximum angle in degrees between the planes of two objects that stand on the same ground, and their maximum distance
 below the objects, as a fraction of the size of the smaller object."""
@@ -133,6 +136,10 @@ def prepare_objects(
         if scene.filled is not None:
             new = np.full(int(scene.filled.is_new.sum()), _NEW)
             origins = np.concatenate([origins[scene.filled.is_retained], new])
+            earlier = (origins == _NEW) & ~scene.filled.is_new
+            scene, origins = _with_new_floor(scene, origins, earlier)
+        else:
+            scene, origins = _with_new_floor(scene, origins, origins == _NEW)
         notes += [f"{name}: {note}" for note in scene.notes]
         scenes[name], rest = scene, scene.background
         up = scene.plane.normal if up is None else up
@@ -205,6 +212,36 @@ def _in_remaining_scene(spec: ObjectSpec, cloud: GaussianCloud, rest: GaussianCl
             chosen[new] = chosen[known][neighbours].mean(axis=1) > 0.5
         picked = chosen
     return replace(spec, clicks=clicks, picked=picked)
+
+
+def _with_new_floor(
+    scene: PreparedScene, origins: np.ndarray, is_earlier: np.ndarray
+) -> tuple[PreparedScene, np.ndarray]:
+    """Move new floor that lies on top of the object from the background to the object: the floor was made where another
+    object had stood, and the search for this object may have missed it.
+
+    Args:
+        scene: The prepared object.
+        origins: (n,) int, index in the capture of each Gaussian of the background.
+        is_earlier: (n,) bool, True for new floor of earlier holes.
+
+    Returns:
+        The object with this floor, and the indices of the remaining background.
+    """
+    size = scene.located.size
+    means = scene.background.means.numpy().astype(np.float64)
+    on_top = is_earlier & (scene.plane.heights(means) > _MIN_TOP * size)
+    if on_top.any():
+        distances = KDTree(scene.object.means.numpy()).query(means[on_top])[0]
+        on_top[on_top] = distances < _ON_TOP * size
+    if not on_top.any():
+        return scene, origins
+    moved = replace(
+        scene,
+        object=concatenate(scene.object, scene.background.subset(on_top)),
+        background=scene.background.subset(~on_top),
+    )
+    return moved, origins[~on_top]
 
 
 def _moved_click(click: Click, places: np.ndarray) -> Click:

@@ -28,7 +28,7 @@ from egs_warp.short_repr import short_repr
 
 _CELL = 0.04
 """Distance between lattice points, relative to the height of the tallest object."""
-_REACH, _DEPTH, _ABOVE = 2.5, 1.0, 0.5
+_REACH, _DEPTH, _ABOVE = 2.5, 2.0, 0.5
 """Extent of the lattice: beside the objects, below the ground and above the highest object, relative to the height of
 the tallest object. A body that falls over the edge of the ground lands on a floor at this depth, unless the capture
 shows a surface above it."""

@@ -15,6 +15,7 @@ from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.height_field import HeightField
+from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
@@ -35,6 +36,8 @@ _RAISE_TOLERANCE = 1e-4
 """Depth in the ground at the start that is left, in body heights."""
 _NEAR_GROUND = 0.02
 """Distance from the ground within which a body comes to rest on uneven ground before the start, in body heights."""
+_ON_BODY = 0.08
+"""Maximum distance between the base of a body and the top of the body on which it stands, in heights of the first."""
 _MAX_SETTLING_TILT = 15.0
 """Maximum angle in degrees by which a body may tilt while it comes to rest on uneven ground."""
 _MAX_POSITION = 1e4
@@ -274,6 +277,10 @@ class World:
                     " another place"
                 )
             body = replace(body, start=state)
+        if raise_above_bodies and gaps.min() > _NEAR_GROUND * height:
+            below = [each.body for each in self._members.values() if _is_below(each.body, body)]
+            tops = tuple(_box_around(each.contact_points()) for each in below)
+            body = replace(body, stands_on_body=bool(below), solids=(*body.solids, *tops))
         return replace(member, body=body)
 
     def _check_place(self, member: PlacedBody) -> None:
@@ -293,6 +300,22 @@ def _lifted(body: CapturedBody, height: float) -> BodyState:
     return replace(body.start, positions=body.start.positions + height * GROUND.normal)
 
 
+def _is_below(other: CapturedBody, body: CapturedBody) -> bool:
+    """Return True if ``body`` stands on ``other``: the top of its box is at the base of the body."""
+    points, theirs = body.contact_points(), other.contact_points()
+    low, high = theirs.min(axis=0), theirs.max(axis=0)
+    over = ((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(axis=1)
+    return bool(over.any() and abs(points[over, 2].min() - high[2]) < _ON_BODY * body.body.height)
+
+
+def _box_around(points: np.ndarray) -> Solid:
+    """Return the box around ``points`` (n, 3)."""
+    axes = np.eye(3)
+    upper = [Plane(axis, -float((points @ axis).max())) for axis in axes]
+    lower = [Plane(-axis, float((points @ axis).min())) for axis in axes]
+    return Solid((*upper, *lower))
+
+
 def check_apart(first: PlacedBody, second: PlacedBody) -> None:
     """Raise ``UserError`` if two bodies overlap at the start: a contact point of one is inside the level set of the
     other."""
@@ -306,20 +329,13 @@ def check_apart(first: PlacedBody, second: PlacedBody) -> None:
 
 def _depth(body: CapturedBody, other: CapturedBody) -> float:
     """Return the depth (m) of the deepest contact point of ``body`` in ``other``; 0 if their boxes do not overlap."""
-    points, theirs = _contact_points(body), _contact_points(other)
+    points, theirs = body.contact_points(), other.contact_points()
     if (points.min(axis=0) > theirs.max(axis=0)).any() or (theirs.min(axis=0) > points.max(axis=0)).any():
         return 0.0
     shape, at = other.body, other.start.positions
     turn = shape.best_fit_rotation(at)
     rest = (points - shape.centre_of_mass(at)) @ turn + shape.centre_of_mass(shape.mesh.nodes)
     return max(0.0, -float(other.shape.level_set.evaluate(rest)[0].min()))
-
-
-def _contact_points(body: CapturedBody) -> np.ndarray:
-    """Return the contact points (P, 3) m of a body at its start."""
-    geometry = body.geometry
-    nodes = body.start.positions[geometry.mesh.tets[geometry.tet_from_point]]
-    return np.einsum("pw,pwi->pi", geometry.weights, nodes)
 
 
 def _heading_of(creature: Creature) -> float:

@@ -12,14 +12,20 @@ import pytest
 from egs_warp.assets import pawn
 from egs_warp.contact.terrain import Solid
 from egs_warp.errors import UserError
+from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
+from egs_warp.motions.jump_plan import JumpTarget
+from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.simulated_run import simulate
+from egs_warp.pipelines.surroundings import Surroundings
 from egs_warp.pipelines.world import World
 from egs_warp.pipelines.world_run import simulate_world
 from tests.support.creatures import coarse_pawn
+from tests.support.scenes import blocks
 
+UP = np.array([0.0, 0.0, 1.0])
 WALL = Solid((Plane(np.array([-1.0, 0.0, 0.0]), 1.0),))
 """Everything beyond x = 1."""
 
@@ -152,3 +158,35 @@ def test_what_goes_over_the_edge_of_the_ground_falls() -> None:
     t = simulate_world(pushed, {}, frames=90)[member.name].trajectory
     assert t.positions[-1, :, 0].mean() > 1.0 and t.positions[-1, :, 2].mean() < -0.5
     assert np.isfinite(t.positions).all()
+
+
+@pytest.mark.slow
+def test_a_body_is_placed_as_captured_and_stands_on_another_one() -> None:
+    """The pawn of a capture stands on a block below it. In a world that is turned by 90 degrees, both are at their
+    places; the pawn's stance starts on the block, and the jump over its edge ends 0.4 lower."""
+    creature = coarse_pawn()
+    own = creature.frame
+    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    axes = turn @ own.axes
+    block = make_prop(
+        blocks(((-0.6, -0.6, -0.4), (0.6, 0.6, -0.02))),
+        plane=Plane(UP, 0.4),
+        metres_per_unit=own.scale,
+    )
+    frame = BodyFrame(axes, own.origin - 0.4 * UP, own.scale)
+    world = World(surroundings=Surroundings(frame, creature.cloud))
+    world.add(block, name="block", as_captured=True)
+    placed = world.add(creature, name="pawn", as_captured=True).body
+    assert isinstance(placed, Creature) and placed.stands_on_body and not world.member("block").body.stands_on_body
+    captured = own.capture_points(creature.start.positions)
+    np.testing.assert_allclose(frame.capture_points(placed.start.positions), captured, atol=0.03)
+    stance = initial_stance(placed)
+    np.testing.assert_allclose(stance.ground.origin[2], 0.4 * own.scale, atol=0.03)
+    assert len(stance.contact_points) > 3 and len(stance.feet()) == len(initial_stance(creature).feet())
+    lower = stance.landing(JumpTarget(distance=2.0, height=0.2))
+    assert lower.rise == pytest.approx(-0.4 * own.scale, abs=0.03)
+    with pytest.raises(UserError, match="the world has no surroundings"):
+        World().add(creature, as_captured=True)
+    smaller = World(surroundings=Surroundings(replace(frame, scale=2.0 * own.scale), creature.cloud))
+    with pytest.raises(UserError, match="creature-1: its scale and up direction are not those of the surroundings"):
+        smaller.add(creature, as_captured=True)
