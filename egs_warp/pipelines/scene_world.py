@@ -68,7 +68,7 @@ class SceneWorld:
     world: World
     """The world, with a body for each object."""
     obstacles: SceneObstacles
-    """What the bodies can touch, apart from each other."""
+    """Ground and obstacles that the bodies can touch."""
     notes: tuple[str, ...] = field(default=())
     """Notes for the user."""
 

@@ -183,7 +183,7 @@ def _scene_request(folder: Path, tree: Mapping[str, Any], entries: Mapping[str, 
         given = entry["object"]
         values = [given] if isinstance(given, str) else given
         objects[name] = SceneObject(
-            tuple(_beside(folder, value) for value in values),
+            tuple(_relative_to(folder, value) for value in values),
             SceneBody(entry.get("prop", False), entry.get("front"), entry.get("nodes"), entry.get("density")),
             Plane.from_coefficients(*entry["plane"]) if "plane" in entry else None,
             entry.get("view"),
@@ -199,7 +199,7 @@ def _scene_request(folder: Path, tree: Mapping[str, Any], entries: Mapping[str, 
     )
 
 
-def _beside(folder: Path, value: str) -> str:
+def _relative_to(folder: Path, value: str) -> str:
     """Return ``value`` with the path of ``folder`` if it names a file in it, such as a mask or ``picked.json:NAME``."""
     file = value.partition(".json:")[0] + ".json" if ".json:" in value else value
     return str(folder / value) if (folder / file).exists() else value

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import warp as wp
 
 from egs_warp import cli
 from egs_warp.assets import pawn
 from egs_warp.commands.animate_scene import motions_of, named_objects
 from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import concatenate, with_degree
 from egs_warp.io import write_ply
+from egs_warp.locomotion.trajectory import Trajectory
+from tests.support.scenes import blocks
 
 
 def test_objects_have_names_or_none_has(tmp_path: Path) -> None:
@@ -59,3 +66,38 @@ def test_mistakes_are_refused_in_one_line(
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=300, device="cpu").cloud)
     assert cli.main(["animate", str(tmp_path / "pawn.ply"), "-o", str(tmp_path / "out"), *flags]) == 2
     assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.slow
+def test_two_objects_of_a_scene_become_bodies_of_one_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two pawns 1.5 apart on a board: their places in the film's world are their places in the capture, the board ends
+    at its edge, and the written collision mesh can be read again."""
+    thing = pawn(gaussian_count=3000, device="cpu").cloud
+    shifted = replace(thing, means=wp.array(thing.means.numpy() + np.float32([1.5, 0.0, 0.0]), dtype=wp.vec3))
+    board = blocks(((-1.5, -1.5, -0.04), (3.0, 1.5, 0.0)))
+    write_ply(tmp_path / "room.ply", concatenate(*(with_degree(each, 0) for each in (thing, shifted, board))))
+    out, mesh = tmp_path / "out", tmp_path / "mesh.glb"
+    selected = [
+        "--object",
+        "near=0,0,0.5",
+        "--object",
+        "far=1.5,0,0.5",
+        "--prop",
+        "far",
+        "--motion",
+        "near: jump to far",
+    ]
+    quick = ["--up", "z", "--straddling", "split", "--no-inpaint", "--frames", "4", "--size", "64"]
+    command = ["animate", str(tmp_path / "room.ply"), *selected, *quick]
+    assert cli.main([*command, "--save-collision-mesh", str(mesh), "-o", str(out)]) == 0
+    printed = capsys.readouterr()
+    assert "the ground ends beside the objects" in printed.err and printed.out.startswith("near: cut off: jump to far")
+    files = json.loads((out / "manifest.json").read_text())["files"]
+    assert {"world.mp4", "obstacles.png", "background.ply", "near/object.ply", "far/segment.png"} <= files.keys()
+    near, far = (Trajectory.load(out / name / "trajectory.npz").positions[0].mean(axis=0) for name in ("near", "far"))
+    height = 1.0 / thing.means.numpy()[:, 2].max()
+    np.testing.assert_allclose(far[:2] - near[:2], [1.5 * height, 0.0], atol=0.05)
+    assert Trajectory.load(out / "far" / "trajectory.npz").ground_coefficients.min() < -1.0
+    again = [*command, "--collision-mesh", str(mesh), "-o", str(tmp_path / "again")]
+    assert cli.main(again) == 0
+    assert "obstacles:" not in capsys.readouterr().err
