@@ -59,13 +59,14 @@ def animate_world(args: argparse.Namespace) -> bool:
 
 def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
     """Create a world with ``read``, simulate and film it; return True if the exit status must report a failure."""
+    from egs_warp.io.ply import write_ply
     from egs_warp.io.run_folder import run_folder
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.motions.style import read_style
     from egs_warp.pipelines.animate import PREVIEW_SIZE
     from egs_warp.pipelines.animate_world import COMMAND, write_world
     from egs_warp.pipelines.progress import simulation_bar
-    from egs_warp.pipelines.scene_pictures import write_scene_parts
+    from egs_warp.pipelines.scene_pictures import write_object
     from egs_warp.pipelines.scene_script import SceneProgress
     from egs_warp.pipelines.simulated_run import check_frames
     from egs_warp.pipelines.world_run import simulate_world
@@ -82,7 +83,8 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
         # The parts are written first, so that a later error does not lose minutes of work.
         progress = SceneProgress(
             print_note,
-            lambda prepared: write_scene_parts(prepared, folder),
+            lambda name, scene: write_object(name, scene, folder),
+            lambda background: write_ply(folder.file("background.ply"), background),
             lambda obstacles, surroundings: _write_obstacles(args, folder, obstacles, surroundings),
         )
         scripted = read(progress)

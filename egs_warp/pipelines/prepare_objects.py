@@ -85,6 +85,7 @@ def prepare_objects(
     options: SceneOptions | None = None,
     prepare: Preparer | None = None,
     progress: Callable[[str], object] = lambda name: None,
+    show_object: Callable[[str, PreparedScene], object] = lambda name, scene: None,
 ) -> PreparedObjects:
     """Cut several objects out of a capture and fill their holes, one after the other.
 
@@ -100,6 +101,7 @@ def prepare_objects(
         options: Options; None uses the default.
         prepare: Function that prepares one object; None uses ``prepare_scene`` with ``cameras`` and ``options``.
         progress: Called with the name of each object before it is cut out.
+        show_object: Called with the name and the preparation of each object when it is finished.
 
     Raises:
         UserError: A stage failed, or an object belongs to one before it; the message begins with its name.
@@ -142,6 +144,7 @@ def prepare_objects(
             scene, origins = _with_new_floor(scene, origins, origins == _NEW)
         notes += [f"{name}: {note}" for note in scene.notes]
         scenes[name], rest = scene, scene.background
+        show_object(name, scene)
         up = scene.plane.normal if up is None else up
     return PreparedObjects(scenes, _common_planes(scenes), tuple(notes))
 

@@ -10,12 +10,11 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, concatenate, with_degree
 from egs_warp.inpainting.picture import before_and_after
-from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.io.video import contact_sheet, write_png
 from egs_warp.pipelines.obstacle_cloud import make_obstacles
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
-from egs_warp.pipelines.prepare_objects import PreparedObjects
+from egs_warp.pipelines.prepare_scene import PreparedScene
 from egs_warp.pipelines.scene_obstacles import SceneObstacles
 from egs_warp.pipelines.surroundings import Surroundings
 from egs_warp.render.rasteriser import render_gaussians
@@ -31,30 +30,28 @@ _OVERLAY = 0.55
 """Opacity of the obstacles over the scene."""
 
 
-def write_scene_parts(prepared: PreparedObjects, run: RunFolder) -> None:
-    """Write the remaining scene, ``background.ply``, and in a folder for each object ``object.ply``, ``plane.json`` and
-    pictures.
+def write_object(name: str, scene: PreparedScene, run: RunFolder) -> None:
+    """Write ``object.ply``, ``plane.json`` and pictures of an object into its folder.
 
     Args:
-        prepared: The objects and the remaining scene.
+        name: Name of the object and of its folder.
+        scene: The prepared object.
         run: Folder of the run.
     """
-    write_ply(run.file("background.ply"), prepared.background)
-    for name, scene in prepared.scenes.items():
-        place = run.folder(name)
-        place.mkdir(exist_ok=True)
-        scene.write(place, has_background=False)
-        centre, size = scene.located.centre, scene.located.size
-        cameras = picture_cameras(scene.plane, centre, size)
-        whole = concatenate(*_alike(scene.object, scene.background_with_hole))
-        pictures = {
-            "plane.png": plane_picture(whole, [scene.plane], cameras, centre=centre, size=size),
-            "segment.png": segmentation_picture(whole, scene.object, scene.background_with_hole, cameras),
-        }
-        if scene.filled is not None:
-            pictures["filled.png"] = before_and_after(scene.filled)
-        for file, picture in pictures.items():
-            write_png(place / file, picture)
+    place = run.folder(name)
+    place.mkdir(exist_ok=True)
+    scene.write(place, has_background=False)
+    centre, size = scene.located.centre, scene.located.size
+    cameras = picture_cameras(scene.plane, centre, size)
+    whole = concatenate(*_alike(scene.object, scene.background_with_hole))
+    pictures = {
+        "plane.png": plane_picture(whole, [scene.plane], cameras, centre=centre, size=size),
+        "segment.png": segmentation_picture(whole, scene.object, scene.background_with_hole, cameras),
+    }
+    if scene.filled is not None:
+        pictures["filled.png"] = before_and_after(scene.filled)
+    for file, picture in pictures.items():
+        write_png(place / file, picture)
 
 
 def obstacle_picture(obstacles: SceneObstacles, surroundings: Surroundings) -> np.ndarray:

@@ -70,8 +70,10 @@ class SceneProgress:
 
     show_stage: Callable[[str], object] = lambda stage: None
     """Called with a description of each stage as it starts."""
-    show_prepared: Callable[[PreparedObjects], object] = lambda prepared: None
-    """Called with the objects of a scene before their bodies are created."""
+    show_object: Callable[[str, PreparedScene], object] = lambda name, scene: None
+    """Called with the name and the preparation of each object of a scene when it is finished."""
+    show_background: Callable[[GaussianCloud], object] = lambda background: None
+    """Called with the scene without the objects, in the frame of the capture."""
     show_obstacles: Callable[[SceneObstacles, Surroundings], object] = lambda obstacles, surroundings: None
     """Called with the obstacles of a scene before the bodies are created."""
 
@@ -137,8 +139,9 @@ def read_scene_parts(
         planes=planes,
         prepare=prepare,
         progress=lambda name: progress.show_stage(f"cutting {name} out of the scene"),
+        show_object=progress.show_object,
     )
-    progress.show_prepared(prepared)
+    progress.show_background(prepared.background)
     made = make_scene_world(
         prepared,
         bodies,
