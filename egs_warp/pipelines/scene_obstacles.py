@@ -45,6 +45,8 @@ _CLOSED = 2
 """Half width of gaps in the ground that are closed, cells."""
 _MIN_GROUND, _MAX_HOLE = 40, 200
 """Minimum number of columns of a part of the ground, and maximum number of columns of a hole in it that is closed."""
+_FOOT = 0.1
+"""Height up to which a part of an object stands on the ground, relative to the height of the tallest object."""
 _MIN_EDGE = 0.02
 """Fraction of the columns without ground from which the ground has an edge."""
 _MIN_SOLID = 60
@@ -123,7 +125,7 @@ def measure_obstacles(
         return SceneObstacles(ground, given or (), low, high)
     notes = []
     heights = field.ground_height(_columns(lattice))
-    feet = np.concatenate([each[each[:, 2] < 0.5 * height] for each in objects.values()])
+    feet = np.concatenate([each[each[:, 2] < _FOOT * height] for each in objects.values()])
     known = _known_ground(lattice, heights, feet)
     is_uneven = any(scene.ground is not None for scene in prepared.scenes.values())
     if (~known).mean() > _MIN_EDGE:
