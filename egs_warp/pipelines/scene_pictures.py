@@ -58,7 +58,7 @@ def obstacle_picture(obstacles: SceneObstacles, surroundings: Surroundings) -> n
     """Return (H, W, 3) uint8, views of the scene without the objects, with ground (green), what is below its edge (red)
     and solids (grey) drawn over it."""
     scene = surroundings.cloud
-    reach = 0.42 * float(np.linalg.norm((obstacles.high - obstacles.low)[:2]))
+    reach = 0.35 * float(np.linalg.norm((obstacles.high - obstacles.low)[:2]))
     middle = 0.5 * (obstacles.low + obstacles.high) * [1.0, 1.0, 0.0]
     cameras = ring_cameras(GROUND, middle, reach, count=4, elevations=(20.0, 45.0), size=_SIDE)
     solids = make_obstacles(obstacles.solids, obstacles.low, obstacles.high, device=str(scene.device))
