@@ -258,7 +258,8 @@ class World:
             deepest = int(np.argmin(gaps))
             lift = -float(gaps[deepest]) if faces[deepest] == 0 else 0.0
             if raise_above_bodies:
-                depths = [max(_depth(body, other.body), _depth(other.body, body)) for other in self._members.values()]
+                below = [other.body for other in self._members.values() if _is_below(other.body, body)]
+                depths = [max(_depth(body, other), _depth(other, body)) for other in below]
                 depth = max(depths, default=0.0)
                 on_body |= depth > 0.0
                 lift = max(lift, depth)
