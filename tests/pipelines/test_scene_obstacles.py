@@ -11,7 +11,7 @@ from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.pipelines.locate_plane import LocatedPlane
 from egs_warp.pipelines.prepare_objects import PreparedObjects
 from egs_warp.pipelines.prepare_scene import PreparedScene
-from egs_warp.pipelines.scene_obstacles import SceneObstacles, measure_obstacles
+from egs_warp.pipelines.scene_obstacles import SceneObstacles, box_between, measure_obstacles
 from egs_warp.segmentation.object_spec import Segmentation
 from tests.support.scenes import blocks
 
@@ -73,3 +73,20 @@ def test_level_ground_without_an_edge_is_a_plane() -> None:
     found = obstacles_of(((-3.2, -3.2, -0.04), (3.2, 3.2, 0.0)))
     assert found.ground is None and found.solids == ()
     assert found.notes == ("obstacles: none; nothing stands beside the objects",)
+
+
+def test_given_solids_replace_the_measured_ones() -> None:
+    """Solids are given in the frame of the capture; in a world of another scale they are scaled, and the ground is
+    still measured."""
+    none = np.zeros(1, bool)
+    located = LocatedPlane(GROUND, None, np.array([0.0, 0.0, 0.5]), 1.0, Segmentation(none, none, none, 1.0), ())
+    background = blocks(TABLE, BOX)
+    scene = PreparedScene(OBJECT, background, background, GROUND, None, located, ())
+    frame = BodyFrame(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3), 0.5)
+    prepared = PreparedObjects({"thing": scene}, {"thing": GROUND}, ())
+    box = box_between(np.array([0.6, -0.4, -1.0]), np.array([1.0, 0.4, 0.5]))
+    found = measure_obstacles(prepared, frame, height=0.5, solids=(box,))
+    assert len(found.solids) == 1 and len(found.notes) == 1
+    assert found.ground is not None and found.ground.ground_height(np.array([0.9, 0.0, 0.0])) < -0.5
+    assert surface_above(found.solids, np.array([0.0, -0.4, 0.0]), UP) == 0.25
+    assert surface_above(found.solids, np.array([0.4, 0.0, 0.0]), UP) == -np.inf
