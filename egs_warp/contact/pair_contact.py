@@ -48,6 +48,8 @@ class PairBody:
     """Level set of the shape at rest."""
     rest_positions: np.ndarray
     """(N, 3) m, nodes of the cage at rest in the frame of the level set."""
+    is_driven: bool = False
+    """True if the body follows a path, so that no contact moves it."""
 
 
 class PairContactDetector:
@@ -89,7 +91,7 @@ class PairContactDetector:
 
     def body_pairs(self, positions: np.ndarray) -> list[tuple[int, int]]:
         """Return the ordered pairs (a, b) of bodies whose inflated boxes overlap at ``positions`` (N, 3), both (a, b)
-        and (b, a), in ascending order.
+        and (b, a), in ascending order. Two driven bodies are no pair.
         """
         boxes = []
         for body, weights, part in zip(self.bodies, self._box_weights, self._split(positions), strict=True):
@@ -99,6 +101,8 @@ class PairContactDetector:
             boxes.append((corners.min(axis=0) - margin, corners.max(axis=0) + margin))
         lows, highs = (np.array(each).reshape(-1, 3) for each in zip(*boxes, strict=True))
         overlaps = np.all((lows[:, None] <= highs) & (lows <= highs[:, None]), axis=2)
+        driven = np.array([body.is_driven for body in self.bodies])
+        overlaps &= ~(driven[:, None] & driven)
         np.fill_diagonal(overlaps, False)
         return [(int(a), int(b)) for a, b in np.argwhere(overlaps)]
 

@@ -15,6 +15,9 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.rigid_path import RigidPath
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.prop import Prop, make_prop
@@ -190,3 +193,18 @@ def test_a_body_is_placed_as_captured_and_stands_on_another_one() -> None:
     smaller = World(surroundings=Surroundings(replace(frame, scale=2.0 * own.scale), creature.cloud))
     with pytest.raises(UserError, match="creature-1: its scale and up direction are not those of the surroundings"):
         smaller.add(creature, as_captured=True)
+
+
+def test_a_driven_prop_follows_its_path_and_its_balances_hold() -> None:
+    world = World()
+    path = RigidPath([0.2, 0.4], [(0.0, 0.0, 0.2), (0.3, 0.0, 0.0)], [0.0, 90.0])
+    lift = world.add(prop(), heading=0.0, path=path)
+    run = simulate_world(world, {})[lift]
+    t = run.trajectory
+    assert t.time[-1] >= 0.4
+    assert t.positions[-1] == pytest.approx(path.moved(t.positions[0], 0.4), abs=1e-12)
+    result = audit(t)
+    assert result.momentum_residual < 1e-12 and result.angular_momentum_residual < 1e-12
+    assert energy_balance(t).max_residual < 1e-9
+    with pytest.raises(UserError, match=r"^creature-2: it is a creature, which moves with its muscles"):
+        world.add(coarse_pawn(), path=path)
