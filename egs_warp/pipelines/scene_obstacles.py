@@ -282,7 +282,8 @@ def _boxes(
             if is_below and abs(high[2] - base) < spacing:
                 high[2] = base
         boxes.append(box_between(low, high))
-    note = f"obstacles: {len(boxes)} boxes cover {100 * cover.share:.0f} % of what stands beside the objects"
+    count = f"{len(boxes)} boxes cover" if len(boxes) > 1 else "a box covers"
+    note = f"obstacles: {count} {100 * cover.share:.0f} % of what stands beside the objects"
     return tuple(boxes), note if boxes else "obstacles: none; nothing stands beside the objects"
 
 
