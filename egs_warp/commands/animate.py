@@ -235,8 +235,9 @@ def _animate(args: argparse.Namespace) -> int:
     objects = named_objects(args.object)
     if is_world(args.capture) or objects:
         check_run_folder(args.out, overwrite=args.overwrite, writes=("sheet.png", "report.json"))
-        failed = animate_world(args) if is_world(args.capture) else animate_scene_world(args, objects)
-        return EXIT_NOT_AS_REQUESTED if failed else 0
+        if not is_world(args.capture):
+            return EXIT_NOT_AS_REQUESTED if animate_scene_world(args, objects) else 0
+        return run_animate(args)
     for flag in ("prop", "collision_mesh", "save_collision_mesh"):
         if getattr(args, flag) is not None:
             raise UserError(f"--{flag.replace('_', '-')}: it is for objects with names; give --object NAME=... as well")
@@ -249,6 +250,8 @@ def _animate(args: argparse.Namespace) -> int:
 def run_animate(args: argparse.Namespace) -> int:
     """Run ``egs-warp animate`` with the output folder already checked; return the exit status."""
     try:
+        if is_world(args.capture):
+            return EXIT_NOT_AS_REQUESTED if animate_world(args) else 0
         report = _animate_scene(args) if args.object is not None else _animate_capture(args)
     except BaseException as error:
         # With --overwrite, the folder may still contain the earlier run, which must not be resumed as this run.

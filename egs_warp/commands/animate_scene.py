@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egs_warp.commands.animate_world import check_world_flags, run_world
+from egs_warp.commands.animate_world import WORLD_FLAGS, check_flags, run_world
 from egs_warp.commands.flags import chosen_inpainter, parse_up
 from egs_warp.commands.segment import clearing_of
 from egs_warp.errors import UserError, did_you_mean
@@ -87,7 +87,7 @@ def animate_scene_world(args: argparse.Namespace, objects: Mapping[str, tuple[st
     from egs_warp.pipelines.scene_script import read_scene_parts
     from egs_warp.pipelines.world_file import WorldScript
 
-    check_world_flags(args, "it has no effect on several objects of a scene; leave it out", also=_FLAGS)
+    check_flags(args, (*WORLD_FLAGS, *_FLAGS), "it has no effect on several objects of a scene; leave it out")
     props = tuple(args.prop or ())
     for name in props:
         if name not in objects:

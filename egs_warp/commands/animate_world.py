@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from egs_warp.commands.camera_flags import shot_of
+from egs_warp.commands.config import NAME, write_config
 from egs_warp.commands.flags import parse_direction
 from egs_warp.commands.scene_flags import print_above_bars, print_note, start_device
 from egs_warp.errors import UserError
@@ -23,7 +24,7 @@ WorldReader: TypeAlias = "Callable[[SceneProgress], WorldScript]"
 """Function that creates a world."""
 WORLD_ENDINGS = (".yaml", ".yml")
 """Endings of the names of world files."""
-_FLAGS = (
+WORLD_FLAGS = (
     *("capture", "out", "overwrite", "device", "camera", "size", "fps", "background", "view_from", "no_shadow"),
     *("frames", "no_get_up", "style", "preview"),
 )
@@ -35,11 +36,14 @@ def is_world(capture: str) -> bool:
     return Path(capture).suffix.lower() in WORLD_ENDINGS
 
 
-def check_world_flags(args: argparse.Namespace, problem: str, *, also: tuple[str, ...] = ()) -> None:
-    """Raise ``UserError`` with the ``problem`` for flags that apply neither to a world nor are in ``also``."""
+def check_flags(
+    args: argparse.Namespace,
+    allowed: Sequence[str],
+    problem: str = "is for a single capture; a world file describes its bodies; leave it out",
+) -> None:
+    """Raise ``UserError`` with the ``problem`` for a flag of the command that is not ``allowed``."""
     for action in args.parser._actions:
-        known = action.dest in _FLAGS or action.dest in also
-        if action.dest in vars(args) and not known and getattr(args, action.dest) != action.default:
+        if action.dest in vars(args) and action.dest not in allowed and getattr(args, action.dest) != action.default:
             flag = action.option_strings[0] if action.option_strings else action.dest
             raise UserError(f"{flag}: {problem}")
 
@@ -49,8 +53,7 @@ def animate_world(args: argparse.Namespace) -> bool:
     checked the output folder."""
     from egs_warp.pipelines.world_file import read_world_file
 
-    problem = "is for a single capture; a world file describes its bodies; leave it out"
-    check_world_flags(args, problem, also=("save_collision_mesh",))
+    check_flags(args, (*WORLD_FLAGS, "config", "save_collision_mesh"))
     return run_world(
         args,
         lambda progress: read_world_file(Path(args.capture), progress, device=args.device),
@@ -60,11 +63,12 @@ def animate_world(args: argparse.Namespace) -> bool:
 def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
     """Create a world with ``read``, simulate and film it; return True if the exit status must report a failure."""
     from egs_warp.io.ply import write_ply
-    from egs_warp.io.run_folder import run_folder
+    from egs_warp.io.run_folder import ANIMATE_WORLD, run_folder
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.motions.style import read_style
     from egs_warp.pipelines.animate import PREVIEW_SIZE
-    from egs_warp.pipelines.animate_world import COMMAND, write_world
+    from egs_warp.pipelines.animate_world import write_world
+    from egs_warp.pipelines.finished_run import PARTS
     from egs_warp.pipelines.progress import simulation_bar
     from egs_warp.pipelines.scene_pictures import write_object
     from egs_warp.pipelines.scene_script import SceneProgress
@@ -79,7 +83,12 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
     view_from = None if args.view_from is None else parse_direction("view-from", args.view_from)
     ffmpeg_program()
     start_device(args.device)
-    with run_folder(args.out, command=COMMAND, overwrite=args.overwrite) as folder:
+    # The flags of objects of a scene are not stored, so only the run of a world file can be resumed.
+    is_file = is_world(args.capture)
+    resume = is_file and args.resume
+    with run_folder(args.out, command=ANIMATE_WORLD, overwrite=args.overwrite, resume=resume) as folder:
+        if is_file:
+            folder.begin_with(lambda: write_config(folder.file(NAME), args, args.parser))
         # The parts are written first, so that a later error does not lose minutes of work.
         progress = SceneProgress(
             print_note,
@@ -100,6 +109,8 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
                 style=style,
                 pushes=scripted.pushes,
                 get_up=not args.no_get_up,
+                parts=(lambda name: _folder_of(folder, name) / PARTS) if is_file else None,
+                resume=folder.path if folder.resumed else None,
                 progress=show_frames,
             )
         report = write_world(
@@ -131,3 +142,10 @@ def _write_obstacles(
     if args.save_collision_mesh is not None:
         write_collision_mesh(args.save_collision_mesh, obstacles, surroundings.frame)
         print_note(f"collision mesh: {args.save_collision_mesh}")
+
+
+def _folder_of(folder: RunFolder, name: str) -> Path:
+    """Return the folder of a body, which is created."""
+    path = folder.folder(name)
+    path.mkdir(exist_ok=True)
+    return path
