@@ -17,7 +17,6 @@ from pathlib import Path
 
 from annotated_scenes import DrawnScene, read_drawn
 from clicking import clicked
-from egs_warp.commands.object_flag import read_object
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.inpainting.picture import before_and_after
@@ -31,6 +30,7 @@ from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.facing_direction import mean_view
 from egs_warp.pipelines.film import draw_film
 from egs_warp.pipelines.ground_coverage import ground_coverage_warning
+from egs_warp.pipelines.object_selection import read_object
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
 from egs_warp.pipelines.prepare_scene import PreparedScene, prepare_scene, viewing_directions
 from egs_warp.pipelines.report import GaussianCounts, report_of_run

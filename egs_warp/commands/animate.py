@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from egs_warp.commands.animate_scene import animate_scene_world, named_objects
 from egs_warp.commands.animate_world import animate_world, is_world
 from egs_warp.commands.camera_flags import add_camera_flags, shot_of
 from egs_warp.commands.config import NAME, add_config_flag, changed_capture, write_config
@@ -52,6 +53,7 @@ EXAMPLES = (
     'scan.spz --motion "hop x3, twist 180" --camera follow --size 1280x720 --out out/hop',
     "room.ply --object 0,0,0.5 --up=-y --motion walk --out out/walk",
     "room.ply --object picked.json --out out/picked",
+    'room.ply --object bear=0,0,0.5 --object box=1,0,0.5 --prop box --motion "bear: jump to box" --out out/two',
     "thing.ply --up z --background transparent --out out/cut_out",
     "--config out/jump/run.yaml --friction 0.4 --out out/slippery",
 )
@@ -80,8 +82,8 @@ def add_parser(commands: Commands) -> None:
     common.add_argument(
         "--motion",
         default="jump",
-        help='motion (jump), several as "hop x3, twist 180", with a gesture as "walk 1 + nod", or a script.json'
-        " (docs/motions/index.md)",
+        help='motion (jump), several as "hop x3, twist 180", with a gesture as "walk 1 + nod", a script.json, or, for'
+        ' several objects, "NAME: MOTION; NAME: MOTION" (docs/motions/index.md)',
     )
     motion = animate.add_argument_group("motion")
     body = animate.add_argument_group("body and ground")
@@ -164,6 +166,24 @@ def add_parser(commands: Commands) -> None:
     )
     add_straddling_flag(scene)
     add_inpainter_flags(scene, default=None)
+    scene.add_argument(
+        "--prop",
+        action="append",
+        metavar="NAME",
+        help="with --object NAME=..., the object NAME is a stiff prop without muscles (repeat the flag for several)",
+    )
+    scene.add_argument(
+        "--collision-mesh",
+        type=named_path,
+        metavar="FILE.glb",
+        help="with --object NAME=..., read the obstacles from this mesh, in the frame of the capture",
+    )
+    scene.add_argument(
+        "--save-collision-mesh",
+        type=named_path,
+        metavar="FILE.glb",
+        help="with --object NAME=..., write ground and obstacles as a mesh, in the frame of the capture",
+    )
     scene.add_argument("--no-inpaint", action="store_true", help="leave the floor under the object as captured")
     camera.add_argument(
         "--view-from",
@@ -212,9 +232,15 @@ def complete_help(parser: argparse.ArgumentParser) -> None:
 def _animate(args: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import check_run_folder
 
-    if is_world(args.capture):
+    objects = named_objects(args.object)
+    if is_world(args.capture) or objects:
         check_run_folder(args.out, overwrite=args.overwrite, writes=("sheet.png", "report.json"))
+        if not is_world(args.capture):
+            return EXIT_NOT_AS_REQUESTED if animate_scene_world(args, objects) else 0
         return run_animate(args)
+    for flag in ("prop", "collision_mesh", "save_collision_mesh"):
+        if getattr(args, flag) is not None:
+            raise UserError(f"--{flag.replace('_', '-')}: it is for objects with names; give --object NAME=... as well")
     check_run_folder(args.out, overwrite=args.overwrite, writes=_WRITES)
     if args.config is not None and changed_capture(args.config, args.capture):
         print_note(f"{args.capture} differs from the capture of the run in {args.config}; the result will differ")

@@ -1,11 +1,11 @@
-"""``egs-warp animate WORLD.yaml``: simulate and film the bodies of a world file."""
+"""``egs-warp animate WORLD.yaml``: simulate and film the bodies of a world."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from egs_warp.commands.camera_flags import shot_of
 from egs_warp.commands.config import NAME, write_config
@@ -15,12 +15,18 @@ from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
     from egs_warp.io.run_folder import RunFolder
+    from egs_warp.pipelines.scene_obstacles import SceneObstacles
+    from egs_warp.pipelines.scene_script import SceneProgress
+    from egs_warp.pipelines.surroundings import Surroundings
+    from egs_warp.pipelines.world_file import WorldScript
 
+WorldReader: TypeAlias = "Callable[[SceneProgress], WorldScript]"
+"""Function that creates a world."""
 WORLD_ENDINGS = (".yaml", ".yml")
 """Endings of the names of world files."""
-_FLAGS = (
+WORLD_FLAGS = (
     *("capture", "out", "overwrite", "device", "camera", "size", "fps", "background", "view_from", "no_shadow"),
-    *("frames", "no_get_up", "style", "preview", "config"),
+    *("frames", "no_get_up", "style", "preview"),
 )
 """Flags that also apply to a world."""
 
@@ -30,17 +36,33 @@ def is_world(capture: str) -> bool:
     return Path(capture).suffix.lower() in WORLD_ENDINGS
 
 
-def check_flags(args: argparse.Namespace, allowed: Sequence[str]) -> None:
-    """Raise ``UserError`` for a flag of the command that is not ``allowed`` for a world."""
+def check_flags(
+    args: argparse.Namespace,
+    allowed: Sequence[str],
+    problem: str = "is for a single capture; a world file describes its bodies; leave it out",
+) -> None:
+    """Raise ``UserError`` with the ``problem`` for a flag of the command that is not ``allowed``."""
     for action in args.parser._actions:
         if action.dest in vars(args) and action.dest not in allowed and getattr(args, action.dest) != action.default:
             flag = action.option_strings[0] if action.option_strings else action.dest
-            raise UserError(f"{flag}: is for a single capture; a world file describes its bodies; leave it out")
+            raise UserError(f"{flag}: {problem}")
 
 
 def animate_world(args: argparse.Namespace) -> bool:
-    """Run or resume ``egs-warp animate`` for a world file; return True if the exit status must report a failure. The
-    caller has checked the output folder."""
+    """Run ``egs-warp animate`` for a world file; return True if the exit status must report a failure. The caller has
+    checked the output folder."""
+    from egs_warp.pipelines.world_file import read_world_file
+
+    check_flags(args, (*WORLD_FLAGS, "config", "save_collision_mesh"))
+    return run_world(
+        args,
+        lambda progress: read_world_file(Path(args.capture), progress, device=args.device),
+    )
+
+
+def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
+    """Create a world with ``read``, simulate and film it; return True if the exit status must report a failure."""
+    from egs_warp.io.ply import write_ply
     from egs_warp.io.run_folder import ANIMATE_WORLD, run_folder
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.motions.style import read_style
@@ -48,11 +70,11 @@ def animate_world(args: argparse.Namespace) -> bool:
     from egs_warp.pipelines.animate_world import write_world
     from egs_warp.pipelines.finished_run import PARTS
     from egs_warp.pipelines.progress import simulation_bar
+    from egs_warp.pipelines.scene_pictures import write_object
+    from egs_warp.pipelines.scene_script import SceneProgress
     from egs_warp.pipelines.simulated_run import check_frames
-    from egs_warp.pipelines.world_file import read_world
     from egs_warp.pipelines.world_run import simulate_world
 
-    check_flags(args, _FLAGS)
     shot, background = shot_of(args)
     if background is not None:
         raise UserError("--background: a world has a colour or transparent as its background; give one of these")
@@ -61,9 +83,22 @@ def animate_world(args: argparse.Namespace) -> bool:
     view_from = None if args.view_from is None else parse_direction("view-from", args.view_from)
     ffmpeg_program()
     start_device(args.device)
-    with run_folder(args.out, command=ANIMATE_WORLD, overwrite=args.overwrite, resume=args.resume) as folder:
-        folder.begin_with(lambda: write_config(folder.file(NAME), args, args.parser))
-        scripted = read_world(args.capture, device=args.device, progress=lambda name: print_note(f"preparing {name}"))
+    # The flags of objects of a scene are not stored, so only the run of a world file can be resumed.
+    is_file = is_world(args.capture)
+    resume = is_file and args.resume
+    with run_folder(args.out, command=ANIMATE_WORLD, overwrite=args.overwrite, resume=resume) as folder:
+        if is_file:
+            folder.begin_with(lambda: write_config(folder.file(NAME), args, args.parser))
+        # The parts are written first, so that a later error does not lose minutes of work.
+        progress = SceneProgress(
+            print_note,
+            lambda name, scene: write_object(name, scene, folder),
+            lambda background: write_ply(folder.file("background.ply"), background),
+            lambda obstacles, surroundings: _write_obstacles(args, folder, obstacles, surroundings),
+        )
+        scripted = read(progress)
+        if args.save_collision_mesh is not None and scripted.parts is None:
+            raise UserError("--save-collision-mesh: the world has no scene, so it has no obstacles; leave it out")
         for note in scripted.notes:
             print_note(note)
         with simulation_bar() as show_frames:
@@ -74,7 +109,7 @@ def animate_world(args: argparse.Namespace) -> bool:
                 style=style,
                 pushes=scripted.pushes,
                 get_up=not args.no_get_up,
-                parts=lambda name: _folder_of(folder, name) / PARTS,
+                parts=(lambda name: _folder_of(folder, name) / PARTS) if is_file else None,
                 resume=folder.path if folder.resumed else None,
                 progress=show_frames,
             )
@@ -93,6 +128,20 @@ def animate_world(args: argparse.Namespace) -> bool:
     print_above_bars(report.summary())
     print_above_bars(f"film: {args.out / str(report.film)} (sheet.png and report.json are beside it)")
     return report.state.is_failure
+
+
+def _write_obstacles(
+    args: argparse.Namespace, folder: RunFolder, obstacles: SceneObstacles, surroundings: Surroundings
+) -> None:
+    """Write the picture of the obstacles of a scene, and the file of ``--save-collision-mesh``."""
+    from egs_warp.io.video import write_png
+    from egs_warp.pipelines.scene_collision import write_collision_mesh
+    from egs_warp.pipelines.scene_pictures import OBSTACLE_PICTURE, obstacle_picture
+
+    write_png(folder.file(OBSTACLE_PICTURE), obstacle_picture(obstacles, surroundings))
+    if args.save_collision_mesh is not None:
+        write_collision_mesh(args.save_collision_mesh, obstacles, surroundings.frame)
+        print_note(f"collision mesh: {args.save_collision_mesh}")
 
 
 def _folder_of(folder: RunFolder, name: str) -> Path:

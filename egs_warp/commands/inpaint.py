@@ -112,10 +112,11 @@ def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, backgro
     """Return the hole that the flags define, otherwise the ``recorded`` one."""
     import numpy as np
 
-    from egs_warp.commands.object_flag import read_object
+    from egs_warp.commands.scene_input import SELECTION_FLAGS
     from egs_warp.inpainting.holes import disc, footprint, unseen
     from egs_warp.io import read_capture
     from egs_warp.io.cameras import read_posed_images
+    from egs_warp.pipelines.object_selection import read_object
 
     if args.object is not None:
         cloud = read_capture(args.object, device=args.device).cloud_aligned_with(background)
@@ -138,5 +139,5 @@ def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, backgro
     poses = read_posed_images(args.cameras).relative_to(background.origin)
     for message in poses.messages:
         print(f"note: {message}")
-    spec = read_object(args.mask, background.cloud, poses.images, view=args.view)
+    spec = read_object(args.mask, background.cloud, poses.images, view=args.view, names=SELECTION_FLAGS)
     return unseen(plane, spec.masks)

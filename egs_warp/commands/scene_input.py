@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from egs_warp.commands.flags import parse_plane, parse_up
-from egs_warp.commands.object_flag import picked_object, read_object
 from egs_warp.commands.scene_flags import print_note, start_device
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
@@ -22,11 +21,14 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.cameras import PosedImage, read_posed_images
 from egs_warp.io.capture import read_capture
 from egs_warp.io.planes import read_planes
+from egs_warp.pipelines.object_selection import SelectionNames, picked_object, read_object
 from egs_warp.segmentation.object_spec import ObjectSpec
 
 if TYPE_CHECKING:
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions
 
+SELECTION_FLAGS = SelectionNames("--object", "--cameras", "--view", "--mask-model")
+"""Flags that select an object, for messages."""
 _MAX_REST = 0.05
 """Maximum share of the total opacity of a capture that is outside an object that counts as the whole capture. For an
 object on a white desk or a turntable, the share of the haze after a short training is 0.01 to 0.03."""
@@ -146,14 +148,16 @@ def read_scene(args: argparse.Namespace) -> SceneInput:
     spec, front = None, None
     if args.object is None and args.mask_model is not None:
         raise UserError("--mask-model: it needs clicks; give --object +u,v@photo")
-    picked = picked_object(args.object or (), capture.cloud)
+    picked = picked_object(args.object or (), capture.cloud, names=SELECTION_FLAGS)
     if picked is not None:
         if args.mask_model is not None:
             raise UserError("--mask-model: it needs clicks, and a picked object is given; leave one of them out")
         spec, front = ObjectSpec(picked=picked.gaussians), picked.front
         plane = picked.plane.plane if plane is None and up is None else plane
     elif args.object is not None:
-        spec = read_object(args.object, capture.cloud, posed, view=args.view, mask_model=args.mask_model)
+        spec = read_object(
+            args.object, capture.cloud, posed, view=args.view, names=SELECTION_FLAGS, mask_model=args.mask_model
+        )
     notes = capture.notes
     if poses is not None:
         notes = (*notes, *poses.messages)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from egs_warp.commands.object_flag import read_object
-from egs_warp.commands.scene_input import SceneInput
+from egs_warp.commands.scene_input import SELECTION_FLAGS, SceneInput
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import camera_rays
 from egs_warp.geometry.camera_ring import ring_cameras
@@ -20,6 +19,7 @@ from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.io.video import write_png
 from egs_warp.pipelines.locate_plane import known_of_fit, locate_plane
+from egs_warp.pipelines.object_selection import read_object
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_fit import PlaneView, fit_plane
 from egs_warp.segmentation.plane_search import further_planes
@@ -66,7 +66,9 @@ def planes_of_scene(scene: SceneInput, *, plane_mask: str | None, view: str | No
         located = locate_plane(scene.cloud, scene.spec, cameras=scene.cameras, up=scene.up, plane=scene.plane)
         first, centre, size, notes = located.known(), located.centre, located.size, located.notes
     else:
-        masks = read_object(plane_mask, scene.cloud, scene.posed, view=view, flag="--plane-mask").masks
+        masks = read_object(
+            plane_mask, scene.cloud, scene.posed, view=view, names=replace(SELECTION_FLAGS, object="--plane-mask")
+        ).masks
         if not masks:
             raise UserError(f"--plane-mask {plane_mask}: give a mask.png or a folder of masks")
         seen = [SeenSurface.of(scene.cloud, mask.camera) for mask in masks]

@@ -98,8 +98,8 @@ class InpaintResult:
     """Background with the new floor, scene units; first the retained Gaussians, then the new ones."""
     is_new: np.ndarray
     """(n,) bool, True for new Gaussians."""
-    removed: int
-    """Number of Gaussians removed from the background because they lay in the hole."""
+    is_retained: np.ndarray
+    """(m,) bool, True for the Gaussians of the background that were retained; the others lay in the hole."""
     window: PlaneWindow
     """Window of the face-on view."""
     hole: np.ndarray
@@ -112,6 +112,11 @@ class InpaintResult:
     """Duration of each stage, s."""
     notes: tuple[str, ...]
     """Messages for the user."""
+
+    @property
+    def removed(self) -> int:
+        """Number of Gaussians removed from the background because they lay in the hole."""
+        return int((~self.is_retained).sum())
 
 
 def inpaint(
@@ -208,7 +213,7 @@ def inpaint(
         *((f"{100 * stained:.0f} % of the hole was floor stained by the object's shadow or foot",) if stained else ()),
     )
     is_new = np.arange(cloud.count) >= retained.count
-    return InpaintResult(cloud, is_new, int(junk.sum()), window, grown, before, painted, clock.seconds, notes)
+    return InpaintResult(cloud, is_new, ~junk, window, grown, before, painted, clock.seconds, notes)
 
 
 def inpaint_cost(hole: Hole | None, *, steps: int) -> float:

@@ -24,15 +24,20 @@ _ANDERSON_DEPTH = 4
 """Number of iterates from which the next one is extrapolated."""
 
 
-def settle(stepper: LocomotionStepper) -> BodyState:
+def settle(stepper: LocomotionStepper, start: np.ndarray | None = None) -> BodyState:
     """Let the body come to rest on its ground by long contact steps without muscles, each of which starts with zero
     velocity.
 
     If the body collapses, its fall is not computed to the end: the loop ends once a node moves by more than 0.2 H in
     one step, or the centre of mass has moved by more than 0.1 H in total.
+
+    Args:
+        stepper: stepper of the body.
+        start: (N, 3) m, nodes at the start; None starts from the captured shape.
     """
     body = stepper.body
-    state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
+    start = body.mesh.nodes if start is None else start
+    state = BodyState(start.copy(), np.zeros_like(start))
     dt = SETTLING_STEP * body.time_unit
     memory = stepper.initial_memory()
     for _ in range(SETTLING_STEPS):
@@ -41,7 +46,7 @@ def settle(stepper: LocomotionStepper) -> BodyState:
         max_displacement = dt * float(np.abs(result.velocities).max())
         state = BodyState(state.positions + dt * result.velocities, np.zeros_like(state.positions))
         memory = replace(memory, points=result.contacts.points, forces=result.forces)
-        centre_displacement = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
+        centre_displacement = body.centre_of_mass(state.positions) - body.centre_of_mass(start)
         if has_settled(body, max_displacement, np.linalg.norm(centre_displacement)):
             break
     return state

@@ -151,7 +151,7 @@ def _solid_within(
         if main and (rest.size == 0 or rest.max() <= _MIN_COMPONENT_TO_BRIDGE * piece_mass.sum()):
             break
     piece = np.asarray(labels == main if main else whole)
-    inside = _fill(piece, cloud.device)
+    inside = fill_enclosed(piece, cloud.device)
     belongs = in_lattice & ndimage.binary_dilation(piece)[at] & (means[:, 2] >= 0.0)
     return LatticeSolid(inside, corner, spacing, longest, belongs, means[:, 2] < 0.0, bridged)
 
@@ -164,8 +164,9 @@ def _bridge(occupied: np.ndarray, radius: int) -> np.ndarray:
     return occupied | (np.asarray(ndimage.distance_transform_edt(grown)) > radius)
 
 
-def _fill(piece: np.ndarray, device: wp.Device) -> np.ndarray:
-    """Return ``piece`` with enclosed space filled. A second pass fills points that only newly filled points enclose."""
+def fill_enclosed(piece: np.ndarray, device: wp.Device) -> np.ndarray:
+    """Return ``piece`` (nx, ny, nz) bool with enclosed space filled. A second pass fills points that only newly filled
+    points enclose."""
     solid = piece
     for _ in range(2):
         filled = wp.zeros(solid.shape, dtype=wp.uint8, device=device)

@@ -103,6 +103,8 @@ class CapturedBody:
     """Motion from the frame of the cage to that of ``start`` (``moved``)."""
     notes: tuple[str, ...] = ()
     """Guesses about the capture, for the user."""
+    stands_on_body: bool = False
+    """True if the body stands on another body of its world at the start, and not on the ground."""
 
     def placed(self, cloud: GaussianCloud) -> GaussianCloud:
         """Transform another cloud of the same capture, such as its background, to the frame of ``start``."""
@@ -136,6 +138,12 @@ class CapturedBody:
             start=Placement(turn, shift).applied_to(self.start),
             placement=self.placement.then(turn, shift),
         )
+
+    def contact_points(self) -> np.ndarray:
+        """Return the contact points (P, 3) m at ``start``."""
+        geometry = self.geometry
+        nodes = self.start.positions[geometry.mesh.tets[geometry.tet_from_point]]
+        return np.einsum("pw,pwi->pi", geometry.weights, nodes)
 
     @property
     def body(self) -> SoftBody:

@@ -60,6 +60,8 @@ _CONTACT_GRID = 2.0**-10
 """Fraction of the height to which contact points are rounded. Jumps are sensitive to the last bits of coordinates,
 which change if a capture is rotated or its unit changes.
 """
+_TOUCHING = 0.01
+"""Distance from the surface below at which points of a standing body touch it, in body heights."""
 MAX_FRICTION = 10.0
 """Maximum Coulomb coefficient of ``CreatureOptions``."""
 
@@ -377,11 +379,16 @@ def initial_stance(creature: Creature, *, step: float | None = None, style: Styl
     """
     body, start = creature.body, creature.start
     up = -body.gravity / np.linalg.norm(body.gravity)
+    plane, touching = GROUND, creature.stepper.detector.points_within(start.positions, _TOUCHING * body.height)
+    if creature.stands_on_body:
+        points = creature.contact_points()
+        base = float(points[:, 2].min())
+        plane, touching = Plane(GROUND.normal, -base), points[points[:, 2] < base + _TOUCHING * body.height]
     return Stance(
         body,
-        GroundFrame.on_plane(GROUND, creature.front.direction, body.centre_of_mass(start.positions), up=up),
+        GroundFrame.on_plane(plane, creature.front.direction, body.centre_of_mass(start.positions), up=up),
         start.positions,
-        creature.stepper.detector.points_within(start.positions, 0.01 * body.height),
+        touching,
         solver_steps(body, step)[0],
         creature.solids,
         creature.geometry.friction,

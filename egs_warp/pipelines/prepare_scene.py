@@ -122,16 +122,18 @@ class PreparedScene:
         """Ground under the object if it is not flat, otherwise None."""
         return self.located.ground
 
-    def write(self, out: Path | RunFolder, known: Sequence[PlaneRecord] = ()) -> None:
+    def write(self, out: Path | RunFolder, known: Sequence[PlaneRecord] = (), *, has_background: bool = True) -> None:
         """Write ``object.ply``, ``background.ply`` and ``plane.json``.
 
         Args:
             out: A folder, or the folder of a run.
             known: Records of the file from which the plane was read; values that were not measured again are copied.
+            has_background: Write ``background.ply``.
         """
         file_path = out.file if isinstance(out, RunFolder) else out.joinpath
         write_ply(file_path("object.ply"), self.object)
-        write_ply(file_path("background.ply"), self.background)
+        if has_background:
+            write_ply(file_path("background.ply"), self.background)
         first = replace(self.located.known(), hole=self.hole.outline() if self.hole else None, light=self.light)
         write_planes(file_path("plane.json"), [first.merged_with(known[0]) if known else first, *known[1:]])
 

@@ -28,8 +28,8 @@ from egs_warp.segmentation.object_spec import ObjectSpec
 
 CACHE = "EGS_WARP_CACHE"
 """Environment variable with the folder of the cache; if it is empty, nothing is cached."""
-MAX_SCENES = 4
-"""Maximum number of scenes in the cache; a new one replaces the least recently used one."""
+MAX_SCENES = 12
+"""Maximum number of objects of scenes in the cache; a new one replaces the least recently used one."""
 _PACKAGES = (*MECHANICS, "torch", "opencv-python-headless", "scikit-image", "onnxruntime")
 """Packages on which a prepared scene depends."""
 

@@ -1,4 +1,4 @@
-"""A world: several bodies, creatures and props, placed on a common ground."""
+"""A world: several bodies, creatures and props, placed on a common ground or where a scene was captured."""
 
 from __future__ import annotations
 
@@ -10,22 +10,38 @@ from typing import TypeVar
 import numpy as np
 
 from egs_warp.contact.detection import ContactDetector
-from egs_warp.contact.terrain import Solid, surface_above
+from egs_warp.contact.terrain import Solid, Surface, surface_above
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
+from egs_warp.fem.body import BodyState
 from egs_warp.fem.driven_step import PathDrive
 from egs_warp.geometry.body_frame import GROUND
+from egs_warp.geometry.height_field import HeightField
+from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.rigid_path import RigidPath
+from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.pipelines.captured_body import CapturedBody, checked_friction
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.prop import Prop
+from egs_warp.pipelines.surroundings import Surroundings
 from egs_warp.short_repr import short_repr
 
 _MAX_OVERLAP = 0.005
 """Depth up to which bodies may overlap at the start, in heights of the shorter body."""
 _MAX_DEPTH = 0.01
 """Depth up to which a body may be inside an obstacle or the ground at the start, in body heights."""
+_MAX_RAISE = 0.1
+"""Maximum height by which a body is raised at the start so that it is not inside the ground or a body below it, in body
+heights."""
+_RAISE_TOLERANCE = 1e-4
+"""Depth in the ground at the start that is left, in body heights."""
+_NEAR_GROUND = 0.02
+"""Distance from the ground within which a body comes to rest on uneven ground before the start, in body heights."""
+_ON_BODY = 0.08
+"""Maximum distance between the base of a body and the top of the body on which it stands, in heights of the first."""
+_MAX_SETTLING_TILT = 15.0
+"""Maximum angle in degrees by which a body may tilt while it comes to rest on uneven ground."""
 _MAX_POSITION = 1e4
 """Maximum coordinate of a place, m."""
 BodyKey = TypeVar("BodyKey", bound="PlacedBody | str")
@@ -48,23 +64,40 @@ class PlacedBody:
 
 
 class World:
-    """Bodies on a common ground: the plane z = 0 of the world, whose z axis points up, and solids on it.
+    """Bodies on a common ground: the plane z = 0 of the world, whose z axis points up, or a height field, and solids.
 
     Add bodies with ``add``, then call ``simulate(world, {member: motion, ...})``. Lengths are in metres.
     """
 
-    def __init__(self, *, solids: Sequence[Solid] = (), friction: float | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        solids: Sequence[Solid] = (),
+        friction: float | None = None,
+        ground: HeightField | None = None,
+        surroundings: Surroundings | None = None,
+    ) -> None:
         """Create a world without bodies.
 
         Args:
             solids: Steps, ramps and walls in addition to the ground, in the frame of the world.
             friction: Coulomb coefficient of the ground and between bodies; None keeps the coefficient of each body,
                 and uses the geometric mean of two coefficients between bodies.
+            ground: Uneven ground in the frame of the world, whose heights are measured along z; None uses the ground of
+                the surroundings, or the plane z = 0.
+            surroundings: What stays of a captured scene: background of the film, ground and obstacles.
 
         Raises:
-            UserError: The friction is invalid.
+            UserError: The friction is invalid, or the heights of the ground are not measured along z.
         """
         self.solids = tuple(solids)
+        self.surroundings = surroundings
+        if ground is None and surroundings is not None:
+            ground = surroundings.ground
+        if ground is not None and float(ground.normal @ GROUND.normal) < 1.0 - 1e-9:
+            given = ",".join(f"{x:.3g}" for x in ground.normal)
+            raise ArgumentError("ground", "its heights are not measured along the z axis of the world", value=given)
+        self.ground = ground
         self.friction = None if friction is None else checked_friction(friction)
         self._members: dict[str, PlacedBody] = {}
 
@@ -85,8 +118,9 @@ class World:
         heading: float | None = None,
         name: str | None = None,
         path: RigidPath | None = None,
+        as_captured: bool = False,
     ) -> PlacedBody:
-        """Place a body on the ground.
+        """Place a body on the ground, or where it was captured.
 
         Args:
             body: A creature or a prop on level ground without solids of its own. The same body may be added repeatedly.
@@ -97,13 +131,17 @@ class World:
             name: Name for messages and files; None numbers the bodies: ``creature-1``, ``prop-2``.
             path: Path that a prop follows from its place, whatever pushes it, such as a lift. It passes through the
                 ground and solids of the world, but carries and pushes other bodies.
+            as_captured: Place the body where it is in the scene of the surroundings, whose capture it belongs to;
+                ``at``, ``above`` and ``heading`` do not apply. It is raised slightly if it is inside the ground or a
+                body below it.
 
         Returns:
             The placed body, its key in the arguments of ``simulate`` and in the result.
 
         Raises:
             UserError: The name or the position is invalid, the name is taken, the body is on a GPU, the ground of the
-                body is not a level plane, the body overlaps a solid or another body, or a creature has a path.
+                body is not a level plane, the body overlaps a solid or another body, it does not stand on uneven ground
+                at this place, or a creature has a path.
         """
         kind = "prop" if isinstance(body, Prop) else "creature"
         name = f"{kind}-{len(self._members) + 1}" if name is None else name
@@ -121,22 +159,37 @@ class World:
                 f"{name}: it is on {device.alias}; worlds are simulated on a CPU, so load its capture there"
             )
         geometry, gravity = body.geometry, body.body.gravity
-        if geometry.field is not None or len(geometry.planes) > 1 or np.abs(gravity[:2]).max() > 0.0:
+        is_uneven = geometry.field is not None and self.ground is None
+        if is_uneven or len(geometry.planes) > 1 or np.abs(gravity[:2]).max() > 0.0:
             raise UserError(f"{name}: its ground is not a level plane; make it without ground, gravity_up and solids")
         if self.friction is not None and self.friction != geometry.friction:
             body = body.with_friction(self.friction)
-        point = np.array([*at, 0.0])
-        surfaces = (Solid((GROUND,)), *self.solids)
-        lift = surface_above(surfaces, point, GROUND.normal)
-        captured_heading = _heading_of(body) if isinstance(body, Creature) else 0.0
-        placed = body.moved((*at, lift + above), 0.0 if heading is None else heading - captured_heading)
+        surfaces = self.surfaces
+        if as_captured:
+            placed = self._as_captured(name, body)
+        else:
+            lift = surface_above(surfaces, np.array([*at, 0.0]), GROUND.normal)
+            captured_heading = _heading_of(body) if isinstance(body, Creature) else 0.0
+            placed = body.moved((*at, lift + above), 0.0 if heading is None else heading - captured_heading)
         placed = replace(placed, stepper=self._own_stepper(placed), solids=surfaces)
         member = PlacedBody(name, placed, path)
+        if as_captured or (self.ground is not None and above == 0.0 and path is None):
+            member = self._resting(member, raise_above_bodies=as_captured)
         self._check_place(member)
         for other in self._members.values():
             check_apart(other, member)
         self._members[name] = member
         return member
+
+    @property
+    def obstacles(self) -> tuple[Solid, ...]:
+        """All solids: those of the world and those of its surroundings."""
+        return (*self.solids, *(self.surroundings.solids if self.surroundings is not None else ()))
+
+    @property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """The ground and all solids."""
+        return (self.ground or Solid((GROUND,)), *self.obstacles)
 
     def member(self, name: str) -> PlacedBody:
         """Return the body ``name``."""
@@ -179,16 +232,70 @@ class World:
         """Return a stepper of ``body`` on the ground of the world. No two bodies share a stepper, because a stepper has
         buffers."""
         old = body.stepper
-        if self.solids:
+        solids = self.obstacles
+        if solids or self.ground is not None:
             geometry = replace(
                 old.geometry,
-                planes=(*old.geometry.planes, *(face for solid in self.solids for face in solid.faces)),
-                solid_from_plane=(0, *(index for index, solid in enumerate(self.solids, 1) for _ in solid.faces)),
+                planes=(GROUND, *(face for solid in solids for face in solid.faces)),
+                solid_from_plane=(0, *(index for index, solid in enumerate(solids, 1) for _ in solid.faces)),
+                field=self.ground,
             )
             device = str(old.body.assembly.device)
             return LocomotionStepper(deepcopy(old.body), old.muscles, geometry, settings=old.settings, device=device)
         is_taken = any(member.body.stepper is old for member in self._members.values())
         return deepcopy(old) if is_taken else old
+
+    def _as_captured(self, name: str, body: Creature | Prop) -> Creature | Prop:
+        """Return ``body`` moved to its place in the capture."""
+        if self.surroundings is None:
+            raise ArgumentError("as_captured", "the world has no surroundings; give a place", value="True")
+        frame, own = self.surroundings.frame, body.frame
+        turn = frame.axes @ own.axes.T
+        if abs(own.scale / frame.scale - 1.0) > 1e-6 or turn[2, 2] < 1.0 - 1e-9:
+            raise UserError(f"{name}: its scale and up direction are not those of the surroundings; make it with them")
+        return body.moved(
+            tuple(frame.points(own.origin).tolist()), float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
+        )
+
+    def _resting(self, member: PlacedBody, *, raise_above_bodies: bool) -> PlacedBody:
+        """Return the body raised out of the ground, and out of the bodies below it, and at rest on the ground if it
+        touches it.
+
+        Raises ``UserError`` if the body falls over on uneven ground.
+        """
+        body, height = member.body, member.body.body.height
+        detector: ContactDetector = body.stepper.detector
+        raised, on_body = 0.0, False
+        while raised < _MAX_RAISE * height:
+            gaps, faces = detector.gaps(body.start.positions)
+            deepest = int(np.argmin(gaps))
+            lift = -float(gaps[deepest]) if faces[deepest] == 0 else 0.0
+            if raise_above_bodies:
+                below = [other.body for other in self._members.values() if _is_below(other.body, body)]
+                depths = [max(_depth(body, other), _depth(other, body)) for other in below]
+                depth = max(depths, default=0.0)
+                on_body |= depth > 0.0
+                lift = max(lift, depth)
+            if lift <= _RAISE_TOLERANCE * height:
+                break
+            raised += lift
+            body = replace(body, start=_lifted(body, lift))
+        gaps, _ = detector.gaps(body.start.positions)
+        if self.ground is not None and not on_body and gaps.min() < _NEAR_GROUND * height:
+            state = settle(body.stepper, body.start.positions)
+            before, after = (body.body.best_fit_rotation(each.positions) for each in (body.start, state))
+            tilt = float(np.degrees(np.arccos(np.clip((after @ before.T)[2, 2], -1.0, 1.0))))
+            if tilt > _MAX_SETTLING_TILT:
+                raise UserError(
+                    f"{member.name}: it falls over at {_where(member)}, because the ground is too uneven there; choose"
+                    " another place"
+                )
+            body = replace(body, start=state)
+        if raise_above_bodies and gaps.min() > _NEAR_GROUND * height:
+            below = [each.body for each in self._members.values() if _is_below(each.body, body)]
+            tops = tuple(_box_around(each.contact_points()) for each in below)
+            body = replace(body, stands_on_body=bool(below), solids=(*body.solids, *tops))
+        return replace(member, body=body)
 
     def _check_place(self, member: PlacedBody) -> None:
         """Raise ``UserError`` if a body is inside a solid of the world or the ground."""
@@ -200,6 +307,27 @@ class World:
             solid = int(body.geometry.solid_of_each_plane[faces[deepest]])
             what = f"solid {solid}" if solid else "the ground"
             raise UserError(f"{member.name}: it is {-gaps[deepest]:.2g} m inside {what} at {_where(member)}; move one")
+
+
+def _lifted(body: CapturedBody, height: float) -> BodyState:
+    """Return the start of ``body``, ``height`` metres higher."""
+    return replace(body.start, positions=body.start.positions + height * GROUND.normal)
+
+
+def _is_below(other: CapturedBody, body: CapturedBody) -> bool:
+    """Return True if ``body`` stands on ``other``: the top of its box is at the base of the body."""
+    points, theirs = body.contact_points(), other.contact_points()
+    low, high = theirs.min(axis=0), theirs.max(axis=0)
+    over = ((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(axis=1)
+    return bool(over.any() and abs(points[over, 2].min() - high[2]) < _ON_BODY * body.body.height)
+
+
+def _box_around(points: np.ndarray) -> Solid:
+    """Return the box around ``points`` (n, 3)."""
+    axes = np.eye(3)
+    upper = [Plane(axis, -float((points @ axis).max())) for axis in axes]
+    lower = [Plane(-axis, float((points @ axis).min())) for axis in axes]
+    return Solid((*upper, *lower))
 
 
 def check_apart(first: PlacedBody, second: PlacedBody) -> None:
@@ -215,20 +343,13 @@ def check_apart(first: PlacedBody, second: PlacedBody) -> None:
 
 def _depth(body: CapturedBody, other: CapturedBody) -> float:
     """Return the depth (m) of the deepest contact point of ``body`` in ``other``; 0 if their boxes do not overlap."""
-    points, theirs = _contact_points(body), _contact_points(other)
+    points, theirs = body.contact_points(), other.contact_points()
     if (points.min(axis=0) > theirs.max(axis=0)).any() or (theirs.min(axis=0) > points.max(axis=0)).any():
         return 0.0
     shape, at = other.body, other.start.positions
     turn = shape.best_fit_rotation(at)
     rest = (points - shape.centre_of_mass(at)) @ turn + shape.centre_of_mass(shape.mesh.nodes)
     return max(0.0, -float(other.shape.level_set.evaluate(rest)[0].min()))
-
-
-def _contact_points(body: CapturedBody) -> np.ndarray:
-    """Return the contact points (P, 3) m of a body at its start."""
-    geometry = body.geometry
-    nodes = body.start.positions[geometry.mesh.tets[geometry.tet_from_point]]
-    return np.einsum("pw,pwi->pi", geometry.weights, nodes)
 
 
 def _heading_of(creature: Creature) -> float:

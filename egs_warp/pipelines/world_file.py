@@ -1,8 +1,9 @@
-"""World files: captures, positions, motions and obstacles of a world in YAML (docs/guide/worlds.md)."""
+"""World files: captures or a scene, positions, motions and obstacles of a world in YAML (docs/guide/worlds.md)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,10 @@ from egs_warp.io.yaml_file import check_schema, line_of, read_yaml
 from egs_warp.motions.push import Push, read_pushes
 from egs_warp.motions.towards import check_motion
 from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
+from egs_warp.pipelines.prepare_scene import SceneOptions
 from egs_warp.pipelines.prop import Prop, make_prop
+from egs_warp.pipelines.scene_script import SceneObject, SceneParts, SceneProgress, SceneRequest, read_scene_parts
+from egs_warp.pipelines.scene_world import SceneBody, SceneWorldOptions
 from egs_warp.pipelines.world import World
 from egs_warp.short_repr import short_repr
 
@@ -27,6 +31,10 @@ SCHEMA = "world.schema.json"
 _PROP_KEYS = ("density", "path", "repeat")
 _CREATURE_KEYS = ("nodes", "front", "motion", "push")
 """Keys that only props, and only creatures, have."""
+_PLACE_KEYS = ("at", "above", "heading", "height", "metres_per_unit", "up", "path", "repeat")
+"""Keys that an object of a scene does not have."""
+_SCENE_KEYS = ("cameras", "up", "metres_per_unit", "flat", "collision_mesh")
+"""Keys of the file that need a scene."""
 _MAKER_KEYS = ("capture", "prop", "up", "front", "plane", "metres_per_unit", "height", "nodes", "density")
 """Keys on which the body depends, apart from its place and motion."""
 
@@ -46,6 +54,8 @@ class WorldScript:
     """Guesses about the captures, for the user."""
     text: Mapping[str, Any]
     """Contents of the file."""
+    parts: SceneParts | None = None
+    """Objects and remaining scene of a file with a scene; None for a file without one."""
 
 
 def read_world(
@@ -59,51 +69,142 @@ def read_world(
     Args:
         path: YAML file; names of captures are relative to its folder.
         device: Warp device; None uses Warp's current device.
-        progress: Called with the name of each body before it is created; not for copies of an earlier body.
+        progress: Called with a description of each stage as it starts; not for copies of an earlier body.
 
     Raises:
         UserError: The file is invalid, or a body cannot be created or placed; the message names the line.
     """
-    path = Path(path)
+    return read_world_file(Path(path), SceneProgress(progress), device=device)
+
+
+def read_world_file(path: Path, progress: SceneProgress, *, device: str | None = None) -> WorldScript:
+    """Read a world file like ``read_world``; the functions of ``progress`` are called in the course of it."""
     tree, node = read_yaml(path)
     check_schema(path, tree, node, SCHEMA)
     entries = tree["bodies"]
     for index, entry in enumerate(entries):
-        _check_keys(path, entry, line_of(node, ["bodies", index]))
-    world = World(solids=tuple(_solid(each) for each in tree.get("obstacles", ())), friction=tree.get("friction"))
+        _check_keys(f"{path}, line {line_of(node, ['bodies', index])}", index, tree, entry)
+    for key in _SCENE_KEYS:
+        if key in tree and "scene" not in tree:
+            line = line_of(node, [key])
+            raise UserError(f"{path}, line {line}: {key} is for a scene; add scene: capture, or leave it out")
+    names = _object_names(path, entries, node)
+    for index, entry in enumerate(entries):
+        # Read first, because the bodies take longer.
+        with _at_line(path, node, index):
+            if "motion" in entry:
+                check_motion(entry["motion"])
+            if "push" in entry:
+                read_pushes(entry["push"])
+    solids = tuple(_solid(each) for each in tree.get("obstacles", ()))
+    parts = None
+    notes: list[str] = []
+    if "scene" in tree:
+        where = {name: f"{path}, line {line_of(node, ['bodies', index])}" for index, name in names.items()}
+        request = _scene_request(path.parent, tree, {name: entries[index] for index, name in names.items()})
+        try:
+            parts = read_scene_parts(request, device=device, solids=solids, progress=progress)
+        except UserError as error:
+            # Errors on an object begin with its name.
+            line = where.get(str(error).partition(":")[0], f"{path}, line {line_of(node, ['scene'])}")
+            raise UserError(f"{line}: {error}") from error
+        world = parts.scene_world.world
+        notes += parts.scene_world.notes
+    else:
+        world = World(solids=solids, friction=tree.get("friction"))
     bodies: dict[str, Creature | Prop] = {}
     motions: dict[str, str] = {}
     pushes: dict[str, tuple[Push, ...]] = {}
-    notes: list[str] = []
     for index, entry in enumerate(entries):
-        where = f"{path}, line {line_of(node, ['bodies', index])}"
-        try:
-            # Read first, because the bodies take longer.
-            if "motion" in entry:
-                check_motion(entry["motion"])
-            pushes_on = read_pushes(entry["push"]) if "push" in entry else ()
-            key = repr([entry.get(name) for name in _MAKER_KEYS])
-            name = entry.get("name", Path(entry["capture"]).stem)
-            if key not in bodies:
-                progress(name)
-                bodies[key] = _make_body(path.parent, entry, device)
-                notes += [f"{name}: {note}" for note in bodies[key].notes]
-            name = _unused_name(world, name) if "name" not in entry else name
-            placed = world.add(
-                bodies[key],
-                at=tuple(entry.get("at", (0.0, 0.0))),
-                above=entry.get("above", 0.0),
-                heading=entry.get("heading"),
-                name=name,
-                path=_path(entry) if "path" in entry else None,
-            )
-        except UserError as error:
-            raise UserError(f"{where}: {error}") from error
+        if index in names:
+            name = names[index]
+        else:
+            with _at_line(path, node, index):
+                name = _add_body(world, path.parent, entry, bodies, notes, device, progress.show_stage)
         if "motion" in entry:
-            motions[placed.name] = entry["motion"]
-        if pushes_on:
-            pushes[placed.name] = pushes_on
-    return WorldScript(world, motions, pushes, tuple(notes), tree)
+            motions[name] = entry["motion"]
+        if "push" in entry:
+            pushes[name] = read_pushes(entry["push"])
+    return WorldScript(world, motions, pushes, tuple(notes), tree, parts)
+
+
+@contextmanager
+def _at_line(path: Path, node: Any, index: int) -> Iterator[None]:
+    """Add the file and the line of a body to the message of a ``UserError``."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{path}, line {line_of(node, ['bodies', index])}: {error}") from error
+
+
+def _add_body(
+    world: World,
+    folder: Path,
+    entry: Mapping[str, Any],
+    bodies: dict[str, Creature | Prop],
+    notes: list[str],
+    device: str | None,
+    show_stage: Callable[[str], object],
+) -> str:
+    """Add the body of an entry with a capture to ``world`` and return its name. ``bodies`` contains the bodies made so
+    far, which copies share; notes on a new body are added to ``notes``."""
+    key = repr([entry.get(name) for name in _MAKER_KEYS])
+    name = entry.get("name", Path(entry["capture"]).stem)
+    if key not in bodies:
+        show_stage(f"preparing {name}")
+        bodies[key] = _make_body(folder, entry, device)
+        notes += [f"{name}: {note}" for note in bodies[key].notes]
+    name = _unused_name(world, name) if "name" not in entry else name
+    return world.add(
+        bodies[key],
+        at=tuple(entry.get("at", (0.0, 0.0))),
+        above=entry.get("above", 0.0),
+        heading=entry.get("heading"),
+        name=name,
+        path=_path(entry) if "path" in entry else None,
+    ).name
+
+
+def _object_names(path: Path, entries: Sequence[Mapping[str, Any]], node: Any) -> dict[int, str]:
+    """Return the names of the bodies that are objects of the scene, by their indices."""
+    names: dict[int, str] = {}
+    for index, entry in enumerate(entries):
+        if "object" in entry:
+            name = entry.get("name", f"object-{index + 1}")
+            if name in names.values():
+                line = line_of(node, ["bodies", index])
+                raise UserError(f"{path}, line {line}: another body has the name {name!r}; choose another one")
+            names[index] = name
+    return names
+
+
+def _scene_request(folder: Path, tree: Mapping[str, Any], entries: Mapping[str, Mapping[str, Any]]) -> SceneRequest:
+    """Return the scene of a file and its objects, by name; names of files are relative to ``folder``."""
+    objects = {}
+    for name, entry in entries.items():
+        given = entry["object"]
+        values = [given] if isinstance(given, str) else given
+        objects[name] = SceneObject(
+            tuple(_relative_to(folder, value) for value in values),
+            SceneBody(entry.get("prop", False), entry.get("front"), entry.get("nodes"), entry.get("density")),
+            Plane.from_coefficients(*entry["plane"]) if "plane" in entry else None,
+            entry.get("view"),
+        )
+    return SceneRequest(
+        folder / tree["scene"],
+        objects,
+        folder / tree["cameras"] if "cameras" in tree else None,
+        tree.get("up"),
+        folder / tree["collision_mesh"] if "collision_mesh" in tree else None,
+        SceneWorldOptions(tree.get("metres_per_unit"), tree.get("friction")),
+        SceneOptions(flat=tree.get("flat", False)),
+    )
+
+
+def _relative_to(folder: Path, value: str) -> str:
+    """Return ``value`` with the path of ``folder`` if it names a file in it, such as a mask or ``picked.json:NAME``."""
+    file = value.partition(".json:")[0] + ".json" if ".json:" in value else value
+    return str(folder / value) if (folder / file).exists() else value
 
 
 def box(at: tuple[float, float], size: tuple[float, float, float], heading: float = 0.0) -> Solid:
@@ -163,13 +264,28 @@ def _solid(entry: Mapping[str, Any]) -> Solid:
     return Solid(tuple(Plane.from_coefficients(*face) for face in entry["solid"]))
 
 
-def _check_keys(path: Path, entry: Mapping[str, Any], line: int) -> None:
+def _check_keys(where: str, index: int, tree: Mapping[str, Any], entry: Mapping[str, Any]) -> None:
+    if ("object" in entry) == ("capture" in entry):
+        given = "both capture and object are given" if "object" in entry else "capture is missing"
+        advice = "give the name of a capture, or object for an object of the scene"
+        raise UserError(f"{where}: bodies.{index + 1}: {given}; {advice}")
+    if "object" in entry:
+        if "scene" not in tree:
+            raise UserError(f"{where}: object is for a scene; add scene: capture to the file")
+        for key in _PLACE_KEYS:
+            if key in entry:
+                raise UserError(
+                    f"{where}: {key} is for a body with a capture; an object has its captured place and"
+                    " size; leave it out"
+                )
+    elif "view" in entry:
+        raise UserError(f"{where}: view is for an object of a scene; leave it out")
     is_prop = entry.get("prop", False)
     for key in _CREATURE_KEYS if is_prop else _PROP_KEYS:
         if key in entry:
             advice = "leave it out, or leave out prop: true" if is_prop else "add prop: true, or leave it out"
             kind = "a creature" if is_prop else "a prop"
-            raise UserError(f"{path}, line {line}: {key} is for {kind}; {advice}")
+            raise UserError(f"{where}: {key} is for {kind}; {advice}")
 
 
 def _make_body(folder: Path, entry: Mapping[str, Any], device: str | None) -> Creature | Prop:

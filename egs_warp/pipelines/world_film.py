@@ -82,16 +82,22 @@ class FilmedWorld:
     """Bodies by name, in the order of the world."""
     solids: tuple[Solid, ...]
     """Obstacles, without the ground."""
+    scene: GaussianCloud | None = None
+    """Captured scene behind the bodies, in the frame of the world."""
+    is_flat: bool = True
+    """True if the ground is flat and hides what is below it."""
 
     @classmethod
     def from_run(cls, run: WorldRun) -> FilmedWorld:
         """Prepare the bodies of a simulated world; their Gaussians are split for their motions."""
         bodies = {}
+        scene = None if run.world.surroundings is None else run.world.surroundings.cloud
         for name, result in run.bodies.items():
             body, simulation = result.body, result.simulation
             shape = ContactShape.of(body.geometry, body.shape.level_set, body.mesh.nodes)
-            bodies[name] = FilmedBody(split_deformer(result), simulation.trajectory, simulation.frames, shape)
-        return cls(bodies, run.world.solids)
+            deformer = split_deformer(result, in_scene=scene is not None)
+            bodies[name] = FilmedBody(deformer, simulation.trajectory, simulation.frames, shape)
+        return cls(bodies, run.world.solids, scene, run.world.ground is None)
 
     @property
     def time(self) -> np.ndarray:
@@ -202,7 +208,7 @@ def draw_world_film(
     """
     shot = shot or Shot()
     steps = film_steps(filmed, shot)
-    cameras = shot.cameras(camera, filmed.motion(), steps)
+    cameras = shot.cameras(camera, filmed.motion(), steps, in_scene=filmed.scene is not None)
     frames = world_frames(filmed, steps, cameras, shot, shadow=shadow)
     path, _ = encode_film(frames, folder, name, cameras[0], shot, filmed.time[steps], quiet=quiet)
     return path.name
@@ -230,7 +236,9 @@ def world_frames(
     obstacles = _obstacles(filmed.solids, filmed.motion().positions.reshape(-1, 3), device)
     deformer = filmed.joint_deformer(None if obstacles is None else obstacles.cloud)
     trajectories = [body.trajectory for body in filmed.bodies.values()]
-    extent = Filmed(np.concatenate([path_of(t) for t in trajectories]), max(t.height for t in trajectories))
+    extent = Filmed(
+        np.concatenate([path_of(t) for t in trajectories]), max(t.height for t in trajectories), filmed.is_flat
+    )
     deform = deformer.deform
     if shadow:
         on_obstacles = None
@@ -239,7 +247,7 @@ def world_frames(
             on_obstacles = ObstacleShadows(obstacles, count, blur_radius=blur, height=extent.height)
         deform = partial(_deform_with_shadows, deformer, filmed.shadows(deformer.rest.device), on_obstacles)
     poses = map(filmed.poses, frames)
-    yield from rendered_frames(deform, deformer.rest, poses, extent, cameras, shot, shadow=shadow)
+    yield from rendered_frames(deform, deformer.rest, poses, extent, cameras, shot, scene=filmed.scene, shadow=shadow)
 
 
 def filmed_device(filmed: FilmedWorld) -> str:
@@ -277,6 +285,10 @@ def _clearest_view(run: WorldRun) -> np.ndarray:
     first, second = np.triu_indices(len(simulations), 1)
     between, reach = paths[first] - paths[second], np.array(radii)[first] + np.array(radii)[second]
     angles = 2.0 * np.pi * (np.arange(_VIEWS) + 0.5) / _VIEWS
+    surroundings = run.world.surroundings
+    if surroundings is not None and surroundings.views is not None:
+        # A capture looks best from where it was photographed.
+        angles = np.arctan2(surroundings.views[:, 1], surroundings.views[:, 0])
     best, best_score = angles[0], -np.inf
     for angle in angles:
         towards, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from egs_warp.commands.object_flag import read_mask
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -25,6 +24,7 @@ from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.photos import read_photo
 from egs_warp.io.planes import read_planes
 from egs_warp.io.writing import WRITERS, writer_of
+from egs_warp.pipelines.object_selection import read_mask
 from tests.support.captures import good_bytes, message, written
 from tests.support.memory import megabytes_of
 

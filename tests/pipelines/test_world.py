@@ -3,6 +3,7 @@ prop comes to rest, and errors name the body and its position."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,16 +12,23 @@ import pytest
 from egs_warp.assets import pawn
 from egs_warp.contact.terrain import Solid
 from egs_warp.errors import UserError
+from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.rigid_path import RigidPath
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.ledger import energy_balance
+from egs_warp.motions.jump_plan import JumpTarget
+from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.simulated_run import simulate
+from egs_warp.pipelines.surroundings import Surroundings
 from egs_warp.pipelines.world import World
 from egs_warp.pipelines.world_run import simulate_world
 from tests.support.creatures import coarse_pawn
+from tests.support.scenes import blocks
 
+UP = np.array([0.0, 0.0, 1.0])
 WALL = Solid((Plane(np.array([-1.0, 0.0, 0.0]), 1.0),))
 """Everything beyond x = 1."""
 
@@ -106,6 +114,85 @@ def test_overlapping_bodies_are_refused() -> None:
         world.add(prop(), at=(0.15, 0.0), name="king")
     world.add(prop(), at=(0.6, 0.0), name="king")
     assert [placed.name for placed in world.members] == ["box", "king"]
+
+
+def edged_ground() -> HeightField:
+    """Return level ground that ends at x = 1 and falls by 1 m there."""
+    x = -3.0 + 0.05 * np.arange(141)
+    heights = np.tile(np.where(x < 1.0, 0.0, -1.0), (141, 1))
+    # As coefficients, the heights have no overshoot at the edge.
+    return replace(
+        HeightField.through(np.eye(3), np.array([-3.0, -3.0, 0.0]), 0.05, np.zeros((141, 141))), coefficients=heights
+    )
+
+
+def test_a_body_rests_on_a_height_field_and_not_where_it_would_fall_over() -> None:
+    """On a slope of 0.1, the prop rests at the height of the ground, tilted like it."""
+    x = 0.1 * np.arange(81)
+    slope = HeightField.through(np.eye(3), np.array([-4.0, -4.0, 0.0]), 0.1, np.tile(0.1 * (x - 4.0), (81, 1)))
+    world = World(ground=slope)
+    member = world.add(prop(), at=(1.0, 0.5))
+    up = member.body.body.best_fit_rotation(member.body.start.positions)[:, 2]
+    np.testing.assert_allclose(up, np.array([-0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0), atol=0.01)
+    gaps, _ = member.body.stepper.detector.gaps(member.body.start.positions)
+    assert abs(gaps.min()) < 0.002
+    with pytest.raises(UserError, match=r"prop-2: it falls over at .* too uneven there"):
+        World(ground=edged_ground()).add(prop(), at=(1.0, 0.0), name="prop-2")
+    tilted = replace(slope, axes=np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+    with pytest.raises(UserError, match="ground 0,1,0: its heights are not measured along the z axis"):
+        World(ground=tilted)
+
+
+@pytest.mark.slow
+def test_what_goes_over_the_edge_of_the_ground_falls() -> None:
+    """Props on the ground and on the floor below it stay. A prop that slides at 4 m/s towards the edge 1 m away falls
+    over it."""
+    world = World(ground=edged_ground())
+    low, high = world.add(prop(), at=(2.0, 0.0), above=0.01), world.add(prop(), at=(0.0, 0.0))
+    assert low.body.start.positions[:, 2].mean() < -0.7
+    run = simulate_world(world, {}, frames=60)
+    for member in (low, high):
+        moved = run[member].trajectory.positions[-1] - run[member].trajectory.positions[0]
+        assert np.abs(moved[:, :2]).max() < 0.01 and np.abs(moved[:, 2]).max() < 0.02
+    pushed = World(ground=edged_ground())
+    member = pushed.add(prop(), at=(0.0, 0.0))
+    start = replace(member.body.start, velocities=member.body.start.velocities + np.array([4.0, 0.0, 0.0]))
+    pushed._members[member.name] = replace(member, body=replace(member.body, start=start))
+    t = simulate_world(pushed, {}, frames=90)[member.name].trajectory
+    assert t.positions[-1, :, 0].mean() > 1.0 and t.positions[-1, :, 2].mean() < -0.5
+    assert np.isfinite(t.positions).all()
+
+
+@pytest.mark.slow
+def test_a_body_is_placed_as_captured_and_stands_on_another_one() -> None:
+    """The pawn of a capture stands on a block below it. In a world that is turned by 90 degrees, both are at their
+    places; the pawn's stance starts on the block, and the jump over its edge ends 0.4 lower."""
+    creature = coarse_pawn()
+    own = creature.frame
+    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    axes = turn @ own.axes
+    block = make_prop(
+        blocks(((-0.6, -0.6, -0.4), (0.6, 0.6, -0.02))),
+        plane=Plane(UP, 0.4),
+        metres_per_unit=own.scale,
+    )
+    frame = BodyFrame(axes, own.origin - 0.4 * UP, own.scale)
+    world = World(surroundings=Surroundings(frame, creature.cloud))
+    world.add(block, name="block", as_captured=True)
+    placed = world.add(creature, name="pawn", as_captured=True).body
+    assert isinstance(placed, Creature) and placed.stands_on_body and not world.member("block").body.stands_on_body
+    captured = own.capture_points(creature.start.positions)
+    np.testing.assert_allclose(frame.capture_points(placed.start.positions), captured, atol=0.03)
+    stance = initial_stance(placed)
+    np.testing.assert_allclose(stance.ground.origin[2], 0.4 * own.scale, atol=0.03)
+    assert len(stance.contact_points) > 3 and len(stance.feet()) == len(initial_stance(creature).feet())
+    lower = stance.landing(JumpTarget(distance=2.0, height=0.2))
+    assert lower.rise == pytest.approx(-0.4 * own.scale, abs=0.03)
+    with pytest.raises(UserError, match="the world has no surroundings"):
+        World().add(creature, as_captured=True)
+    smaller = World(surroundings=Surroundings(replace(frame, scale=2.0 * own.scale), creature.cloud))
+    with pytest.raises(UserError, match="creature-1: its scale and up direction are not those of the surroundings"):
+        smaller.add(creature, as_captured=True)
 
 
 def test_a_driven_prop_follows_its_path_and_its_balances_hold() -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egs_warp.commands.object_flag import read_object
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
@@ -15,6 +14,7 @@ from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.io import read_cameras
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
+from egs_warp.pipelines.object_selection import read_object
 from egs_warp.segmentation.above_plane import SceneAbovePlane, clicked_parts, detached_parts
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.object_mask import segment
@@ -238,11 +238,11 @@ def test_clicks_as_the_user_writes_them(tmp_path: Path) -> None:
     assert with_box.box is not None and with_box.point is None and len(with_box.clicks) == 1
     for texts, message in (
         (["-32,60@b"], "every click removes something; click on the object itself"),
-        (["+32,32@c"], r"--object \+32,32@c: no such camera; the 2 cameras are"),
-        (["+1,1@b"], r"--object \+1,1@b: no Gaussian is visible at this pixel"),
+        (["+32,32@c"], r"object \+32,32@c: no such camera; the 2 cameras are"),
+        (["+1,1@b"], r"object \+1,1@b: no Gaussian is visible at this pixel"),
         (["+64,1@b"], "outside of the 64 x 64 pixels of the view"),
         (["+1.2.3,1@b"], r"1\.2\.3,1 is not a pixel"),
-        (["0,0,1", "0,0,2"], "--object: 2 objects, 0,0,1 and others; give one, and clicks"),
+        (["0,0,1", "0,0,2"], "object: 2 objects, 0,0,1 and others; give one, and clicks"),
     ):
         with pytest.raises(UserError, match=message):
             read_object(texts, cloud, posed)

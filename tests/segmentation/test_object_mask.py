@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from egs_warp.assets import scene
-from egs_warp.commands.object_flag import read_mask, read_object
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
@@ -17,6 +16,7 @@ from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
+from egs_warp.pipelines.object_selection import read_mask, read_object
 from egs_warp.segmentation import floor_remnants
 from egs_warp.segmentation import object_mask as module
 from egs_warp.segmentation.object_mask import segment
@@ -180,15 +180,15 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     assert clicked is not None
     np.testing.assert_allclose(np.linalg.norm(clicked - [0.0, 0.0, 0.5]), 0.5, atol=0.04)
     for text, given, view, message in (
-        ("nothing.png", posed, None, "--object nothing.png: neither a file nor numbers"),
-        ("1,2,3,4", posed, None, "--object 1,2,3,4: 4 numbers"),
-        ("1e300,2,3", posed, None, "--object 1e300,2,3: further than 1e.12 units from the origin"),
+        ("nothing.png", posed, None, "object nothing.png: neither a file nor numbers"),
+        ("1,2,3,4", posed, None, "object 1,2,3,4: 4 numbers"),
+        ("1e300,2,3", posed, None, "object 1e300,2,3: further than 1e.12 units from the origin"),
         ("1,2,3,1,5,6", posed, None, "the box is flat"),
         ("5,5", [], None, "a pixel needs cameras"),
-        ("5,5", posed, None, "3 cameras; choose one with --view"),
-        ("5,5", posed, "\u00b2", "--view \u00b2: no such camera; the 3 cameras are"),
+        ("5,5", posed, None, "3 cameras; choose one with view"),
+        ("5,5", posed, "\u00b2", "view \u00b2: no such camera; the 3 cameras are"),
         ("+5,5@" + "1" * 5000, posed, None, "no such camera; the 3 cameras are"),
-        ("5,5", posed, "nobody", "--view nobody: no such camera; the 3 cameras are"),
+        ("5,5", posed, "nobody", "view nobody: no such camera; the 3 cameras are"),
         ("1,1", posed, "2", "no Gaussian is visible at this pixel"),
         ("99,1", posed, "2", "outside of the 64 x 64 pixels of the view"),
         (str(tmp_path / "other.png"), posed, None, "no photo has the name other"),

@@ -20,7 +20,6 @@ import numpy as np
 
 from egs_warp.commands.animate import add_parser
 from egs_warp.commands.config import with_config
-from egs_warp.commands.object_flag import read_mask
 from egs_warp.contact.terrain import read_terrain
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
@@ -40,6 +39,7 @@ from egs_warp.motions.keyframes import read_keyframes
 from egs_warp.motions.route import read_path
 from egs_warp.motions.script import motion
 from egs_warp.muscles.files import read_muscles
+from egs_warp.pipelines.object_selection import read_mask
 from egs_warp.pipelines.shot import Shot
 from egs_warp.training.checkpoint import Checkpoint
 from egs_warp.version import __version__

@@ -80,3 +80,20 @@ def shell(count: int = 1500) -> np.ndarray:
     angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count)
     around = np.sqrt(1.0 - z**2)
     return 0.5 * np.column_stack([around * np.cos(angle), around * np.sin(angle), z]) + [0.0, 0.0, 0.5]
+
+
+def blocks(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> GaussianCloud:
+    """Return opaque round Gaussians 0.04 apart on the faces of boxes, given by their corners."""
+    points = []
+    for low, high in boxes:
+        axes = [np.arange(a, b + 0.02, 0.04) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        ends = np.array([[axis[0] for axis in axes], [axis[-1] for axis in axes]])
+        points.append(grid[(grid == ends[0]).any(axis=1) | (grid == ends[1]).any(axis=1)])
+    means = np.concatenate(points)
+    count = len(means)
+    quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+    scales = np.full((count, 3), np.log(0.02))
+    return GaussianCloud.from_numpy(
+        means, quaternions, scales, np.full(count, 4.0), np.zeros((count, 1, 3)), device="cpu"
+    )

@@ -1,10 +1,10 @@
-"""Parse the object selection of the command line: masks, a box, a point, a pixel or clicks."""
+"""Parse the text that selects an object of a scene: masks, a box, a point, a pixel or clicks."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +24,6 @@ from egs_warp.segmentation.votes import MaskedView
 
 MAX_MASK_SIDE = 800
 """Maximum side of a mask, pixels; larger masks are downscaled by a whole factor."""
-_HELP = (
-    "give a mask.png, a folder of masks, a picked.json, a point x,y,z, a box x0,y0,z0,x1,y1,z1, a pixel u,v with "
-    "--view, or clicks +u,v@photo on the object and -u,v@photo next to it"
-)
 _MAX_DIGITS = 10
 """Maximum length of a camera number."""
 _SALIENT = "salient"
@@ -38,53 +34,75 @@ _PICKED = re.compile(r"(.+\.json)(?::(.+))?", re.DOTALL | re.IGNORECASE)
 """Pattern of a file of ``egs-warp pick`` and, optionally, the name of an object in it."""
 
 
+@dataclass(frozen=True)
+class SelectionNames:
+    """Names of the values in messages: those of the library, or the flags of a command."""
+
+    object: str = "object"
+    cameras: str = "cameras"
+    view: str = "view"
+    mask_model: str = "mask_model"
+
+    @property
+    def help(self) -> str:
+        """Forms of a selection."""
+        return (
+            "give a mask.png, a folder of masks, a picked.json, a point x,y,z, a box x0,y0,z0,x1,y1,z1, a pixel u,v"
+            f" with {self.view}, or clicks +u,v@photo on the object and -u,v@photo next to it"
+        )
+
+
 def read_object(
     texts: str | Sequence[str],
     cloud: GaussianCloud,
     posed: Sequence[PosedImage] | None,
     *,
     view: str | None = None,
-    flag: str = "--object",
+    names: SelectionNames | None = None,
     mask_model: Path | None = None,
 ) -> ObjectSpec:
-    """Parse the values of ``--object``.
+    """Parse the selection of an object.
 
     A value is a mask file, a folder of masks, a point, a box, a pixel, a click or ``salient``. Clicks may be combined
     with one value of another kind. A mask belongs to the camera whose photo has the same name.
 
     Args:
-        texts: the values, in the order of the flags.
+        texts: the values, in their order.
         cloud: the capture, in which pixels and clicks are located.
         posed: cameras of the capture; None if there are none.
         view: name or number of the camera of a single mask or of a pixel.
-        flag: name of the flag for messages.
+        names: names of the values for messages; None uses those of the library.
         mask_model: file of a network that turns clicks into masks; None to use the clicks themselves.
 
     Raises:
         UserError: for values of another form, and for cameras that are missing or unknown.
     """
+    names = names or SelectionNames()
     values = [texts] if isinstance(texts, str) else list(texts)
     specs: list[ObjectSpec] = []
     clicks: list[Click] = []
     for text in values:
         if not text.strip():
-            raise UserError(f"{flag}: the value is empty; {_HELP}")
+            raise UserError(f"{names.object}: the value is empty; {names.help}")
         click = None if _path_exists(text) else _CLICK.fullmatch(text)
         if click is not None:
-            one = _view_named(posed or (), click[4], text)
-            clicks.append(_click(cloud, one, click[2], click[3], text, inside=click[1] != "-"))
+            one = _view_named(posed or (), click[4], text, names)
+            clicks.append(_click(cloud, one, click[2], click[3], text, names, inside=click[1] != "-"))
         elif not _path_exists(text) and text.count(",") == 1:
-            clicks.append(_pixel(text, cloud, posed, view, flag))
+            clicks.append(_pixel(text, cloud, posed, view, names))
         elif text == _SALIENT and not _path_exists(text):
-            specs.append(_salient(cloud, posed, flag))
+            specs.append(_salient(cloud, posed, names))
         else:
-            specs.append(_parse_location(text, posed, view, flag))
+            specs.append(_parse_location(text, posed, view, names))
     if len(specs) > 1:
-        raise UserError(f"{flag}: {len(specs)} objects, {values[0]} and others; give one, and clicks +u,v@photo")
+        raise UserError(
+            f"{names.object}: {len(specs)} objects, {values[0]} and others; give one, and clicks +u,v@photo"
+        )
     if mask_model is not None:
         if specs or not clicks:
             raise UserError(
-                f"--mask-model {mask_model}: it needs clicks and no other object; give only {flag} +u,v@photo"
+                f"{names.mask_model} {mask_model}: it needs clicks and no other object; give only"
+                f" {names.object} +u,v@photo"
             )
         model = OnnxClickModel.read(mask_model)
         masks = masks_of_clicks(cloud, clicks, [one.camera for one in posed or ()], model)
@@ -92,8 +110,10 @@ def read_object(
     return replace(specs[0], clicks=tuple(clicks)) if specs else ObjectSpec.of_clicks(clicks)
 
 
-def picked_object(texts: Sequence[str], cloud: GaussianCloud) -> PickedObject | None:
-    """Return the object of the value ``picked.json`` or ``picked.json:NAME``; None for other values of ``--object``.
+def picked_object(
+    texts: Sequence[str], cloud: GaussianCloud, *, names: SelectionNames | None = None
+) -> PickedObject | None:
+    """Return the object of the value ``picked.json`` or ``picked.json:NAME``; None for other values.
 
     Raises ``UserError`` for a damaged file, an unknown name, and other values in addition.
     """
@@ -102,7 +122,8 @@ def picked_object(texts: Sequence[str], cloud: GaussianCloud) -> PickedObject | 
         if match is None:
             continue
         if len(texts) > 1:
-            raise UserError(f"--object: {text} is a whole object; leave the other {len(texts) - 1} values out")
+            what = (names or SelectionNames()).object
+            raise UserError(f"{what}: {text} is a whole object; leave the other {len(texts) - 1} values out")
         return read_picked(match[1], cloud).named(match[2], match[1])
     return None
 
@@ -116,96 +137,105 @@ def _path_exists(text: str) -> bool:
         return False
 
 
-def _salient(cloud: GaussianCloud, posed: Sequence[PosedImage] | None, flag: str) -> ObjectSpec:
+def _salient(cloud: GaussianCloud, posed: Sequence[PosedImage] | None, names: SelectionNames) -> ObjectSpec:
     """Return masks of the salient object in each photo."""
     if not posed:
-        raise UserError(f"{flag} {_SALIENT}: needs cameras; give --cameras, or a point x,y,z")
+        raise UserError(f"{names.object} {_SALIENT}: needs cameras; give {names.cameras}, or a point x,y,z")
     masks = salient_masks(cloud, [one.camera for one in posed], SalientModel.installed())
     return ObjectSpec(masks=tuple(masks))
 
 
-def _parse_location(text: str, posed: Sequence[PosedImage] | None, view: str | None, flag: str) -> ObjectSpec:
+def _parse_location(
+    text: str, posed: Sequence[PosedImage] | None, view: str | None, names: SelectionNames
+) -> ObjectSpec:
     """Parse a mask path, a point or a box."""
     if _path_exists(text):
-        return ObjectSpec(masks=tuple(_read_masks(Path(text), posed, view)))
+        return ObjectSpec(masks=tuple(_read_masks(Path(text), posed, view, names)))
     try:
         numbers = np.array([float(part) for part in text.split(",")])
     except ValueError:
-        raise UserError(f"{flag} {text}: neither a file nor numbers; {_HELP}") from None
+        raise UserError(f"{names.object} {text}: neither a file nor numbers; {names.help}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
-        raise UserError(f"{flag} {text}: {len(numbers)} numbers; {_HELP}")
+        raise UserError(f"{names.object} {text}: {len(numbers)} numbers; {names.help}")
     if np.abs(numbers).max() > MAX_COORDINATE:
-        raise UserError(f"{flag} {text}: further than {MAX_COORDINATE:g} units from the origin; {_HELP}")
+        raise UserError(f"{names.object} {text}: further than {MAX_COORDINATE:g} units from the origin; {names.help}")
     if len(numbers) == 3:
         return ObjectSpec(point=numbers)
     low, high = np.minimum(numbers[:3], numbers[3:]), np.maximum(numbers[:3], numbers[3:])
     if (low == high).any():
-        raise UserError(f"--object {text}: the box is flat; give two opposite corners")
+        raise UserError(f"{names.object} {text}: the box is flat; give two opposite corners")
     return ObjectSpec(box=Box(low, high))
 
 
-def _pixel(text: str, cloud: GaussianCloud, posed: Sequence[PosedImage] | None, view: str | None, flag: str) -> Click:
+def _pixel(
+    text: str, cloud: GaussianCloud, posed: Sequence[PosedImage] | None, view: str | None, names: SelectionNames
+) -> Click:
     """Parse a pixel ``u,v`` as a click on the object in ``view``."""
     u, _, v = text.lstrip("+").partition(",")
     try:
         finite = np.isfinite([float(u), float(v)]).all()
     except ValueError:
-        raise UserError(f"{flag} {text}: neither a file nor numbers; {_HELP}") from None
+        raise UserError(f"{names.object} {text}: neither a file nor numbers; {names.help}") from None
     if not finite:
-        raise UserError(f"{flag} {text}: not two numbers; {_HELP}")
+        raise UserError(f"{names.object} {text}: not two numbers; {names.help}")
     if not posed:
-        raise UserError(f"--object {text}: a pixel needs cameras; give --cameras, or a point x,y,z")
-    return _click(cloud, _view_named(posed, view, text), u, v, text, inside=True)
+        raise UserError(f"{names.object} {text}: a pixel needs cameras; give {names.cameras}, or a point x,y,z")
+    return _click(cloud, _view_named(posed, view, text, names), u, v, text, names, inside=True)
 
 
-def _click(cloud: GaussianCloud, one: PosedImage, u: str, v: str, text: str, *, inside: bool) -> Click:
+def _click(
+    cloud: GaussianCloud, one: PosedImage, u: str, v: str, text: str, names: SelectionNames, *, inside: bool
+) -> Click:
     """Locate a click on the capture; ``inside`` is True for a click on the object."""
     camera = one.camera
     try:
         x, y = float(u), float(v)
     except ValueError:
-        raise UserError(f"--object {text}: {u},{v} is not a pixel; {_HELP}") from None
+        raise UserError(f"{names.object} {text}: {u},{v} is not a pixel; {names.help}") from None
     if one.lens is not None:
         x, y = Undistortion.of(camera, one.lens).pixel(x, y)
     if not (0.0 <= x < camera.width and 0.0 <= y < camera.height):
-        raise UserError(f"--object {text}: outside of the {camera.width} x {camera.height} pixels of the view")
+        raise UserError(f"{names.object} {text}: outside of the {camera.width} x {camera.height} pixels of the view")
     click = click_at(cloud, camera, x, y, inside=inside)
     if click is None:
-        raise UserError(f"--object {text}: no Gaussian is visible at this pixel; click on the object")
+        raise UserError(f"{names.object} {text}: no Gaussian is visible at this pixel; click on the object")
     return click
 
 
-def _view_named(posed: Sequence[PosedImage], view: str | None, what: str) -> PosedImage:
-    """Return the camera with the name or number ``view``; ``what`` is the value of ``--object``, for messages."""
+def _view_named(posed: Sequence[PosedImage], view: str | None, what: str, names: SelectionNames) -> PosedImage:
+    """Return the camera with the name or number ``view``; ``what`` is the text of the selection, for messages."""
     if not posed:
-        raise UserError(f"--object {what}: a pixel needs cameras; give --cameras, or a point x,y,z")
+        raise UserError(f"{names.object} {what}: a pixel needs cameras; give {names.cameras}, or a point x,y,z")
     if view is None:
         if len(posed) == 1:
             return posed[0]
-        raise UserError(f"--object {what}: {len(posed)} cameras; choose one with --view NAME or NUMBER")
+        raise UserError(f"{names.object} {what}: {len(posed)} cameras; choose one with {names.view} NAME or NUMBER")
     # int() fails for superscript digits, which isdecimal excludes, and for thousands of digits, hence the limit.
     if view.isdecimal() and len(view) < _MAX_DIGITS and int(view) < len(posed):
         return posed[int(view)]
     for one in posed:
         if view in (one.name, Path(one.name).name, Path(one.name).stem):
             return one
-    names = [Path(one.name).name for one in posed]
-    flag = f"--object {what}" if what.endswith(f"@{view}") else f"--view {view}"
+    photos = [Path(one.name).name for one in posed]
+    value = f"{names.object} {what}" if what.endswith(f"@{view}") else f"{names.view} {view}"
     raise UserError(
-        f"{flag}: no such camera{did_you_mean(view, names)}; the {len(posed)} cameras are {', '.join(names[:3])}, ..."
+        f"{value}: no such camera{did_you_mean(view, photos)}; the {len(posed)} cameras are"
+        f" {', '.join(photos[:3])}, ..."
     )
 
 
-def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None) -> list[MaskedView]:
+def _read_masks(
+    path: Path, posed: Sequence[PosedImage] | None, view: str | None, names: SelectionNames
+) -> list[MaskedView]:
     """Read a mask file or a folder of masks, undistorted and reduced to at most ``MAX_MASK_SIDE`` pixels."""
     files = sorted(path.glob("*.png")) if path.is_dir() else [path]
     if not files:
-        raise UserError(f"--object {path}: no .png in this folder; {_HELP}")
+        raise UserError(f"{names.object} {path}: no .png in this folder; {names.help}")
     if not posed:
-        raise UserError(f"--object {path}: a mask needs its camera; give --cameras, or a point or box")
+        raise UserError(f"{names.object} {path}: a mask needs its camera; give {names.cameras}, or a point or box")
     masks = []
     for file in files:
-        one = _camera_of(file, posed, view if len(files) == 1 else None)
+        one = _camera_of(file, posed, view if len(files) == 1 else None, names)
         camera = one.camera
         size = mask_size(file)
         # Check the size before decoding, because a small file can contain a very large image.
@@ -226,11 +256,11 @@ def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None
     return masks
 
 
-def _camera_of(file: Path, posed: Sequence[PosedImage], view: str | None) -> PosedImage:
+def _camera_of(file: Path, posed: Sequence[PosedImage], view: str | None, names: SelectionNames) -> PosedImage:
     """Return the camera of a mask file: ``view`` if given, otherwise the camera of the photo with a matching name, or
     the only camera."""
     if view is not None:
-        return _view_named(posed, view, str(file))
+        return _view_named(posed, view, str(file), names)
     stems = [(Path(one.name).stem, one) for one in posed]
     for stem, one in stems:
         if stem == file.stem:
@@ -243,7 +273,7 @@ def _camera_of(file: Path, posed: Sequence[PosedImage], view: str | None) -> Pos
         return posed[0]
     raise UserError(
         f"{file}: no photo has the name {file.stem} (photos are {stems[0][0]}, {stems[-1][0]}, ...); "
-        "rename the mask, or choose its camera with --view"
+        f"rename the mask, or choose its camera with {names.view}"
     )
 
 
