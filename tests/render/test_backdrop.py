@@ -111,13 +111,13 @@ def darkness(body: GaussianCloud, plane: Plane, centre: np.ndarray, reach: float
     texel, tangents, passing = 2.0 * reach / 192, np.stack(plane.tangents()), np.ones((192, 192))
     hidden = body.opacities() * 2.0 * np.pi * scales[:, 1] * scales[:, 2] / texel**2
     flat, above = (means - centre) @ tangents.T / texel + 96.0, np.maximum(plane.heights(means), 0.0)
-    for low, high, blur in ((0.0, 0.1, 0.035), (0.1, 0.35, 0.08), (0.35, 2.0, 0.16)):
+    for low, high, blur in ((0.0, 0.06, 0.02), (0.06, 0.3, 0.065), (0.3, 2.0, 0.16)):
         chosen = (above >= low * height) & (above < high * height)
         counts, *_ = np.histogram2d(
             flat[chosen, 1], flat[chosen, 0], bins=192, range=((0, 192), (0, 192)), weights=hidden[chosen]
         )
         covered = 1.0 - np.exp(-blurred(counts, max(float(np.median(scales[:, 1])) / texel, 0.6)))
-        passing *= 1.0 - blurred(covered, max(blur * height / texel, 0.6)) * (0.5 - 1.5 * blur)
+        passing *= 1.0 - blurred(covered, max(blur * height / texel, 0.6)) * (0.6 - 2.5 * blur)
     rays = camera_rays(camera())
     depth = -plane.heights(camera().centre) / (rays @ plane.normal)
     along = (camera().centre + depth[..., None] * rays - centre) @ tangents.T
