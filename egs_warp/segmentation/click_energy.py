@@ -178,6 +178,8 @@ def minimise(
     inside = _cut(links, evidence, log_odds, weights)
     for _ in range(_ROUNDS):
         ratio = _colour_ratio(colours, evidence.area, inside & evidence.nearby, ~inside & evidence.nearby)
+        # Colour is no reason to keep what is nearer to a click beside the object, such as a toy of the same colour.
+        ratio = np.where(evidence.opposition > 0.0, np.minimum(ratio, 0.0), ratio)
         again = _cut(links, evidence, log_odds + weights.colour * np.where(evidence.nearby, ratio, 0.0), weights)
         if (again == inside).all():
             break
