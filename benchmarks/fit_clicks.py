@@ -47,7 +47,7 @@ MIN_ERROR, HITS = 0.01, 5
 
 
 @dataclass(frozen=True)
-class Room:
+class LabelledScene:
     """A room prepared for clicks."""
 
     name: str
@@ -57,13 +57,13 @@ class Room:
     """(m,) bool, opaque Gaussians of the object."""
     truth: np.ndarray
     """(k,) bool, supervoxels of the object."""
-    seen: np.ndarray
+    visible: np.ndarray
     """(k,) blending weight in the judged photos."""
     clicks: tuple[Click, ...]
 
     @classmethod
-    def of(cls, name: str, seed: int, density: float) -> Room:
-        """Build the room ``name`` of ``SCENES``."""
+    def of(cls, name: str, seed: int, density: float) -> LabelledScene:
+        """Build the labelled ``name`` of ``SCENES``."""
         scene = build_scene(name, seed=seed, density=density, device="cpu")
         surface = SurfaceGraph.of(scene.cloud, scene.cameras)
         up = scene.frame.axes[2]
@@ -83,8 +83,8 @@ class Room:
 
     def iou(self, chosen: np.ndarray) -> float:
         """Return the overlap of the ``chosen`` (k,) bool supervoxels with the object."""
-        union = float(self.seen[chosen | self.truth].sum())
-        return float(self.seen[chosen & self.truth].sum()) / max(union, 1e-30)
+        union = float(self.visible[chosen | self.truth].sum())
+        return float(self.visible[chosen & self.truth].sum()) / max(union, 1e-30)
 
 
 def regression(features: np.ndarray, labels: np.ndarray, weights: np.ndarray) -> tuple[tuple[float, ...], float]:
@@ -104,66 +104,71 @@ def regression(features: np.ndarray, labels: np.ndarray, weights: np.ndarray) ->
     return tuple(float(one) for one in slopes), float(best[-1] - slopes @ mean)
 
 
-def first_evidence(room: Room, click: Click, weights: EnergyWeights) -> tuple[SplatGraph, Evidence]:
+def first_evidence(labelled: LabelledScene, click: Click, weights: EnergyWeights) -> tuple[SplatGraph, Evidence]:
     """Return the links and the evidence of one ``click`` on the object."""
-    scale = picture_scale(click.point, room.surface.cameras)
-    links = surface_links(room.surface, scale, weights=weights)
-    seeds, nothing = np.unique(room.surface.cluster[click.hits]), np.zeros(0, int)
-    return links, evidence_of(room.surface, links, seeds, nothing, nothing, room.ground, scale, weights=weights)
+    scale = picture_scale(click.point, labelled.surface.cameras)
+    links = surface_links(labelled.surface, scale, weights=weights)
+    seeds, nothing = np.unique(labelled.surface.cluster[click.hits]), np.zeros(0, int)
+    return links, evidence_of(labelled.surface, links, seeds, nothing, nothing, labelled.ground, scale, weights=weights)
 
 
-def fitted(rooms: Sequence[Room]) -> EnergyWeights:
-    """Return the package's weights with links and supervoxels fitted to ``rooms``."""
-    boundary = [room.is_own[room.surface.links.first] != room.is_own[room.surface.links.second] for room in rooms]
+def fitted(scenes: Sequence[LabelledScene]) -> EnergyWeights:
+    """Return the package's weights with links and supervoxels fitted to ``scenes``."""
+    boundary = []
+    for labelled in scenes:
+        links = labelled.surface.links
+        boundary.append(labelled.is_own[links.first] != labelled.is_own[links.second])
     labels = np.concatenate(boundary).astype(np.float64)
-    links, link_bias = regression(
-        np.concatenate([room.surface.features.matrix() for room in rooms]), labels, np.ones(len(labels))
+    slopes, link_bias = regression(
+        np.concatenate([labelled.surface.features.matrix() for labelled in scenes]), labels, np.ones(len(labels))
     )
-    weights = replace(WEIGHTS, links=links, link_bias=link_bias)
+    weights = replace(WEIGHTS, links=slopes, link_bias=link_bias)
     features, labels, importance = [], [], []
-    for room in rooms:
-        for click in room.clicks:
-            _, evidence = first_evidence(room, click, weights)
-            own = evidence.area * room.truth
-            other = evidence.area * ~room.truth * np.exp(-np.exp(evidence.features[:, 0]) / DECAY)
+    for labelled in scenes:
+        for click in labelled.clicks:
+            _, evidence = first_evidence(labelled, click, weights)
+            own = evidence.area * labelled.truth
+            other = evidence.area * ~labelled.truth * np.exp(-np.exp(evidence.features[:, 0]) / DECAY)
             features.append(evidence.features)
-            labels.append(room.truth)
+            labels.append(labelled.truth)
             importance.append(own / own.sum() + other / other.sum())
     nodes, node_bias = regression(np.concatenate(features), np.concatenate(labels), np.concatenate(importance))
     return replace(weights, nodes=nodes, node_bias=node_bias)
 
 
-def correction(room: Room, links: SplatGraph, chosen: np.ndarray) -> tuple[np.ndarray, bool] | None:
+def correction(labelled: LabelledScene, links: SplatGraph, chosen: np.ndarray) -> tuple[np.ndarray, bool] | None:
     """Return the supervoxels that a click in the middle of the largest wrong part hits, and whether they are the
     object's; None if no part is large enough."""
-    wrong = chosen != room.truth
+    wrong = chosen != labelled.truth
     same = wrong[links.first] & wrong[links.second] & (chosen[links.first] == chosen[links.second])
     pairs = (links.first[same], links.second[same])
     parts = connected_components(coo_array((np.ones(int(same.sum())), pairs), shape=(links.count,) * 2))[1]
-    sizes = np.bincount(parts, room.seen * wrong)
-    if sizes.max() < MIN_ERROR * room.seen[room.truth].sum():
+    sizes = np.bincount(parts, labelled.visible * wrong)
+    if sizes.max() < MIN_ERROR * labelled.visible[labelled.truth].sum():
         return None
-    part = np.flatnonzero(wrong & (parts == int(np.argmax(sizes))) & (room.seen > 0.0))
-    places = room.surface.middles()[part]
-    middle = places[np.argmin(np.linalg.norm(places - np.average(places, axis=0, weights=room.seen[part]), axis=1))]
+    part = np.flatnonzero(wrong & (parts == int(np.argmax(sizes))) & (labelled.visible > 0.0))
+    places = labelled.surface.middles()[part]
+    middle = places[
+        np.argmin(np.linalg.norm(places - np.average(places, axis=0, weights=labelled.visible[part]), axis=1))
+    ]
     hits = part[np.argsort(np.linalg.norm(places - middle, axis=1))[:HITS]]
-    return hits, bool(room.truth[hits[0]])
+    return hits, bool(labelled.truth[hits[0]])
 
 
-def scores(room: Room, click: Click, weights: EnergyWeights, count: int = 3) -> list[float]:
+def scores(labelled: LabelledScene, click: Click, weights: EnergyWeights, count: int = 3) -> list[float]:
     """Return the overlap after each of ``count`` clicks."""
-    scale = picture_scale(click.point, room.surface.cameras)
-    links = surface_links(room.surface, scale, weights=weights)
-    kind = np.zeros(room.surface.count, np.int8)
-    seeds = np.unique(room.surface.cluster[click.hits])
+    scale = picture_scale(click.point, labelled.surface.cameras)
+    links = surface_links(labelled.surface, scale, weights=weights)
+    kind = np.zeros(labelled.surface.count, np.int8)
+    seeds = np.unique(labelled.surface.cluster[click.hits])
     kind[seeds] = 1
     result: list[float] = []
     for _ in range(count):
         more, others = np.setdiff1d(np.flatnonzero(kind == 1), seeds), np.flatnonzero(kind == -1)
-        evidence = evidence_of(room.surface, links, seeds, more, others, room.ground, scale, weights=weights)
-        chosen = minimise(room.surface, links, evidence, weights=weights)
-        result.append(room.iou(chosen))
-        wrong = correction(room, links, chosen)
+        evidence = evidence_of(labelled.surface, links, seeds, more, others, labelled.ground, scale, weights=weights)
+        chosen = minimise(labelled.surface, links, evidence, weights=weights)
+        result.append(labelled.iou(chosen))
+        wrong = correction(labelled, links, chosen)
         if wrong is not None:
             kind[wrong[0]] = 1 if wrong[1] else -1
     return result
@@ -172,24 +177,24 @@ def scores(room: Room, click: Click, weights: EnergyWeights, count: int = 3) -> 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
     parser = flags(__doc__, quick="two rooms of one seed")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[31, 32], help="seeds of the rooms")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[31, 32], help="seeds of the scenes")
     parser.add_argument("--density", type=float, default=0.5, help="factor of the number of Gaussians")
-    parser.add_argument("--fit", action="store_true", help="fit the weights of links and supervoxels to the rooms")
+    parser.add_argument("--fit", action="store_true", help="fit the weights of links and supervoxels to the scenes")
     parser.add_argument(
         "--set", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"), help="replace one weight"
     )
     options: argparse.Namespace = parser.parse_args(arguments)
     names, seeds = (list(SCENES)[:2], options.seeds[:1]) if options.quick else (list(SCENES), options.seeds)
-    rooms = [Room.of(name, seed, options.density) for seed in seeds for name in names]
-    weights = fitted(rooms) if options.fit else WEIGHTS
+    scenes = [LabelledScene.of(name, seed, options.density) for seed in seeds for name in names]
+    weights = fitted(scenes) if options.fit else WEIGHTS
     weights = replace(weights, **{name: float(value) for name, value in options.set})
     print(weights)
     table = Table(scene="<26", first=".3f", second=".3f", third=".3f")
     rows: list[Row] = []
-    for room in rooms:
-        found = np.mean([scores(room, click, weights) for click in room.clicks], axis=0)
-        rows.append({"scene": room.name, "iou": [float(one) for one in found]})
-        table.row(room.name, *found)
+    for labelled in scenes:
+        found = np.mean([scores(labelled, click, weights) for click in labelled.clicks], axis=0)
+        rows.append({"scene": labelled.name, "iou": [float(one) for one in found]})
+        table.row(labelled.name, *found)
     table.row("mean", *np.mean([row["iou"] for row in rows], axis=0))
     table.row("worst", *np.min([row["iou"] for row in rows], axis=0))
     report(options, rows, aims={})

@@ -20,6 +20,7 @@ from egs_warp.segmentation.base_plane import guess_up
 from egs_warp.segmentation.ground import ROUGH, measure_ground
 from egs_warp.segmentation.object_mask import TOUCHING, segment
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
+from egs_warp.segmentation.photo_clicks import ClicksInPhotos, with_photos
 from egs_warp.segmentation.plane_fit import PlaneFit
 from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under, refine_plane
 from egs_warp.segmentation.resting_plane import remove_foot_remnants, resting_plane
@@ -110,11 +111,12 @@ def locate_plane(
         UserError: There is no plane under the object, or no object.
     """
     notes: list[str] = []
-    spec = spec.with_photos(cloud, cameras)
+    spec = with_photos(cloud, spec, cameras)
+    surface = spec.surface if isinstance(spec, ClicksInPhotos) else None
     if plane is not None:
         segmentation = segment(cloud, plane, spec)
         return LocatedPlane(
-            plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, (), surface=spec.surface
+            plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, (), surface=surface
         )
     tilt = _MAX_TILT
     if up is None and isinstance(cloud, Capture):
@@ -163,7 +165,7 @@ def locate_plane(
         segmentation.size,
         segmentation,
         tuple(notes),
-        surface=spec.surface,
+        surface=surface,
     )
 
 
@@ -214,8 +216,9 @@ def with_measured_ground(
             return located
         note = f"the ground seems rough by {rough} of the object's height, but views differ by {noise}: treated as flat"
         return replace(located, notes=(*located.notes, note))
+    spec = with_photos(cloud, spec, cameras, surface=located.surface)
     try:
-        segmentation = segment(cloud, measured.field, replace(spec, surface=located.surface), size=located.size)
+        segmentation = segment(cloud, measured.field, spec, size=located.size)
     except UserError as error:
         note = f"the ground is rough by {rough} of the object's height, but is treated as flat ({error})"
         return replace(located, notes=(*located.notes, note))

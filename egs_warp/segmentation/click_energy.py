@@ -48,7 +48,7 @@ WEIGHTS = EnergyWeights()
 _GAP_DETOUR = 5.0
 """Additional length of a path in empty space, relative to its true length there."""
 _SIGMAS = 3.0
-"""Visible half-length of a Gaussian in standard deviations; its far end is so much farther from a click."""
+"""Visible half-length of a Gaussian in standard deviations; its far end is farther from a click by this length."""
 _NEAREST = 0.02
 """Radius about a click, in picture radii, within which distances do not matter."""
 _FOOT = 0.1
@@ -67,7 +67,7 @@ _ROUNDS = 3
 
 @dataclass(frozen=True)
 class Evidence:
-    """What clicks, photos and ground state about each supervoxel."""
+    """The evidence of clicks, photos and ground for each supervoxel."""
 
     included: np.ndarray
     """(k,) bool, supervoxels that clicks on the object hit."""

@@ -17,7 +17,7 @@ from egs_warp.segmentation.connectivity import close_to, connected_parts, enclos
 from egs_warp.segmentation.floor_remnants import floor_remnants, floor_scatter_height
 from egs_warp.segmentation.labels import labels_of_votes, smoothed_labels
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
-from egs_warp.segmentation.photo_clicks import picked_in_photos
+from egs_warp.segmentation.photo_clicks import ClicksInPhotos, picked_in_photos
 from egs_warp.segmentation.votes import votes_of_masks
 
 _NOTHING_ABOVE = (
@@ -80,7 +80,7 @@ def segment(
             point; the object does not touch the plane; or nothing is left of it.
     """
     scene = SceneAbovePlane.of(cloud, plane)
-    if spec.surface is not None:
+    if isinstance(spec, ClicksInPhotos):
         spec = picked_in_photos(spec, scene)
     if spec.masks:
         claimed_by_user, unknown = _masked(scene, spec)

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.segmentation.clicks import Click
-from egs_warp.segmentation.framing import MIN_PHOTOS, is_in_frame
-from egs_warp.segmentation.surface_graph import SurfaceGraph
 from egs_warp.segmentation.votes import MaskedView
 
 
@@ -43,17 +39,6 @@ class ObjectSpec:
     """Clicks, each of which adds the Gaussians that it hits and their connected parts, or removes them."""
     picked: np.ndarray | None = None
     """(n,) bool, the object's Gaussians as the user has picked them; no search takes place."""
-
-    surface: SurfaceGraph | None = None
-    """The capture prepared for a point or clicks (``with_photos``); None without photos that show the object."""
-
-    def with_photos(self, cloud: GaussianCloud, cameras: Sequence[Camera]) -> ObjectSpec:
-        """Return the description with ``cloud`` prepared for a point or clicks, if there are enough photos of the
-        point; ``cameras`` are the cameras of the photos. Masks and boxes are more precise, so they are unchanged."""
-        if self.surface is not None or self.point is None or self.masks:
-            return self
-        showing = [camera for camera in cameras if is_in_frame(self.point[None], camera)[0]]
-        return replace(self, surface=SurfaceGraph.of(cloud, showing)) if len(showing) >= MIN_PHOTOS else self
 
     @classmethod
     def of_clicks(cls, clicks: Sequence[Click]) -> ObjectSpec:

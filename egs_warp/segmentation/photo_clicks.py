@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.above_plane import SceneAbovePlane
 from egs_warp.segmentation.click_energy import evidence_of, minimise, picture_scale, surface_links
 from egs_warp.segmentation.clicks import Click
+from egs_warp.segmentation.framing import MIN_PHOTOS, is_in_frame
 from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.segmentation.surface_graph import SurfaceGraph
 
@@ -23,7 +26,36 @@ _MAX_WIDTH = 0.05
 """Maximum standard deviation of a hit that is a hard constraint, in picture radii."""
 
 
-def picked_in_photos(spec: ObjectSpec, scene: SceneAbovePlane) -> ObjectSpec:
+@dataclass(frozen=True)
+class ClicksInPhotos(ObjectSpec):
+    """A point or clicks in a capture with photos that show the object."""
+
+    surface: SurfaceGraph | None = None
+    """The capture prepared for the clicks."""
+
+
+def with_photos(
+    cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camera], *, surface: SurfaceGraph | None = None
+) -> ObjectSpec:
+    """Return ``spec`` with ``cloud`` prepared for its point or clicks, if at least eight photos show the point. Masks
+    and boxes are more precise, so they are unchanged.
+
+    Args:
+        cloud: the capture.
+        spec: the user's description of the object.
+        cameras: cameras of the photos.
+        surface: the capture prepared before; None to prepare it.
+    """
+    if spec.point is None or spec.masks:
+        return spec
+    showing = [camera for camera in cameras if is_in_frame(spec.point[None], camera)[0]]
+    if len(showing) < MIN_PHOTOS:
+        return spec
+    surface = surface or SurfaceGraph.of(cloud, showing)
+    return ClicksInPhotos(spec.masks, spec.box, spec.point, spec.clicks, spec.picked, surface)
+
+
+def picked_in_photos(spec: ClicksInPhotos, scene: SceneAbovePlane) -> ClicksInPhotos:
     """Return ``spec`` with the Gaussians that its point and clicks describe as ``picked``, and with only the certain
     hits of its clicks. Raises ``UserError`` if nothing of the object is above the plane."""
     assert spec.surface is not None and spec.point is not None

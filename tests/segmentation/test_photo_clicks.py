@@ -14,7 +14,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import ObjectSpec
-from egs_warp.segmentation.photo_clicks import object_of_clicks
+from egs_warp.segmentation.photo_clicks import object_of_clicks, with_photos
 from egs_warp.segmentation.surface_graph import SurfaceGraph
 from egs_warp.segmentation.votes import MaskedView
 from tests.support.grounds import level, sheet
@@ -72,7 +72,7 @@ def test_a_wall_behind_the_object_is_left_out(against_wall: GaussianCloud) -> No
     wall = (np.arange(against_wall.count) >= BALL) & (heights > 0.1)
     both = segment(against_wall, FLOOR, alone).object_mask
     assert both[own].mean() > 0.99 and both[wall].mean() > 0.95
-    found = segment(against_wall, FLOOR, alone.with_photos(against_wall, photos(9))).object_mask
+    found = segment(against_wall, FLOOR, with_photos(against_wall, alone, photos(9))).object_mask
     assert found[own].mean() > 0.95 and found[wall].mean() < 0.02
 
 
@@ -101,7 +101,7 @@ def test_of_opposite_clicks_on_one_place_the_later_one_counts(twins: GaussianClo
 
 def test_a_wide_hit_of_a_click_is_no_constraint(against_wall: GaussianCloud) -> None:
     """A click on the ball that also hits a Gaussian of the wall, four times as wide as a click, does not select it."""
-    spec = ObjectSpec.of_clicks([click(against_wall, FRONT)]).with_photos(against_wall, photos(9))
+    spec = with_photos(against_wall, ObjectSpec.of_clicks([click(against_wall, FRONT)]), photos(9))
     scales = against_wall.log_scales.numpy().copy()
     scales[BALL + 40] = np.log([0.4, 0.4, 0.01])
     wide = GaussianCloud.from_numpy(
@@ -110,7 +110,7 @@ def test_a_wide_hit_of_a_click_is_no_constraint(against_wall: GaussianCloud) -> 
         *(getattr(against_wall, name).numpy() for name in ("opacity_logits", "sh")),
     )
     hit = Click(spec.clicks[0].point, np.append(spec.clicks[0].hits, BALL + 40))
-    found = segment(wide, FLOOR, ObjectSpec.of_clicks([hit]).with_photos(wide, photos(9))).object_mask
+    found = segment(wide, FLOOR, with_photos(wide, ObjectSpec.of_clicks([hit]), photos(9))).object_mask
     assert found[spec.clicks[0].hits].all() and not found[BALL + 40]
 
 
@@ -126,14 +126,14 @@ def test_the_unit_of_length_changes_nothing(twins: GaussianCloud) -> None:
 
 def test_photos_are_used_only_if_enough_of_them_show_the_point(twins: GaussianCloud) -> None:
     spec = ObjectSpec(point=np.array(FRONT))
-    assert spec.with_photos(twins, photos(7)) is spec
+    assert with_photos(twins, spec, photos(7)) is spec
     elsewhere = [Camera.look_at(np.array([0.0, 9.0, 1.0]), np.array([0.0, 20.0, 1.0]), UP, width=64, height=48)] * 9
-    assert spec.with_photos(twins, [*photos(7), *elsewhere]) is spec
+    assert with_photos(twins, spec, [*photos(7), *elsewhere]) is spec
     masked = ObjectSpec(masks=(MaskedView(photos(1)[0], np.ones((120, 160), bool), "photo"),))
-    assert masked.with_photos(twins, photos(9)) is masked
+    assert with_photos(twins, masked, photos(9)) is masked
 
 
 def test_an_object_below_its_plane_is_reported(twins: GaussianCloud) -> None:
-    spec = ObjectSpec.of_clicks([click(twins, FRONT)]).with_photos(twins, photos(9))
+    spec = with_photos(twins, ObjectSpec.of_clicks([click(twins, FRONT)]), photos(9))
     with pytest.raises(UserError, match="nothing of it lies above the plane around the clicks; click on more of it"):
         segment(twins, Plane(UP, -5.0), spec)
