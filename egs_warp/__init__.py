@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from egs_warp.geometry.height_field import HeightField
     from egs_warp.geometry.main_light import MainLight
     from egs_warp.geometry.plane import Plane
+    from egs_warp.geometry.rigid_path import RigidPath
     from egs_warp.geometry.tetmesh import TetMesh
     from egs_warp.inpainting.holes import footprint
     from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
@@ -88,6 +89,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "geometry.height_field": ("HeightField",),
     "geometry.main_light": ("MainLight",),
     "geometry.plane": ("Plane",),
+    "geometry.rigid_path": ("RigidPath",),
     "geometry.tetmesh": ("TetMesh",),
     "inpainting.holes": ("footprint",),
     "inpainting.inpaint": ("InpaintOptions", "inpaint"),
@@ -178,6 +180,7 @@ __all__ = [
     "Push",
     "Quantity",
     "Report",
+    "RigidPath",
     "Scene",
     "SceneOptions",
     "Script",

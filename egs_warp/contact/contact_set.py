@@ -184,6 +184,10 @@ class ContactSet(BatchedRecord):
         arrays = {name: np.concatenate([value, getattr(others, name)]) for name, value in self.batched_fields()}
         return replace(self, **arrays)
 
+    def of_entries(self, entries: np.ndarray) -> ContactSet:
+        """Return the contacts of one world with the indices ``entries`` (k,)."""
+        return replace(self, **{name: value[entries] for name, value in self.batched_fields()})
+
     def with_nodes_of(self, nodes: slice) -> ContactSet:
         """Return the contacts of one world with node numbers relative to the start of ``nodes``, and -1 for other
         nodes. The result can only be used to compare node numbers."""

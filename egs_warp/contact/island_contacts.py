@@ -32,6 +32,8 @@ class IslandContacts:
     """Detector of the contacts of each body with the ground."""
     pairs: PairContactDetector
     """Detector of the contacts between the bodies."""
+    driven: frozenset[int]
+    """Bodies that follow a path. They have no contacts with the ground."""
     frictions: np.ndarray
     """(k, k + 1) Coulomb coefficients of each body with each other body and, in the last column, with the ground."""
 
@@ -59,6 +61,8 @@ class IslandContacts:
         """
         keys, selected = self.pairs.keys(previous), []
         for body, (ground, positions) in enumerate(self._by_body(end_positions)):
+            if body in self.driven:
+                continue
             own = (keys[:, 0] == body) & (keys[:, 1] < 0)
             points = self.pairs.bodies[body].selector.select(keys[own, 2], loaded[own], ground.gaps(positions)[0])
             selected.append(self.pairs.numbers(body, points, -1))
@@ -109,6 +113,8 @@ class IslandContacts:
         for body, ((ground, before), (_, after)) in enumerate(
             zip(self._by_body(start), self._by_body(end), strict=True)
         ):
+            if body in self.driven:
+                continue
             gaps = ground.gaps(after)[0]
             if gaps.min() < -ACTIVATION_DEPTH * tolerance:
                 own = keys[(keys[:, 0] == body) & (keys[:, 1] < 0), 2]
@@ -118,8 +124,10 @@ class IslandContacts:
         return np.concatenate([*found, self.pairs.find_penetrating(contacts, start, end, tolerance)])
 
     def min_gaps(self, positions: np.ndarray) -> np.ndarray:
-        """Return (k,) m, the minimum gap of each body to the ground and to the other bodies."""
-        least = np.array([ground.gaps(part)[0].min() for ground, part in self._by_body(positions)])
+        """Return (k,) m, the minimum gap of each body to the ground and to the other bodies; at most 0 for a driven
+        body, which does not touch the ground."""
+        parts = enumerate(self._by_body(positions))
+        least = np.array([0.0 if body in self.driven else ground.gaps(part)[0].min() for body, (ground, part) in parts])
         for a, b in self.pairs.body_pairs(positions):
             gap = self.pairs.gaps(a, b, positions).min()
             least[[a, b]] = np.minimum(least[[a, b]], gap)

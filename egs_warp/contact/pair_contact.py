@@ -48,6 +48,8 @@ class PairBody:
     """Level set of the shape at rest."""
     rest_positions: np.ndarray
     """(N, 3) m, nodes of the cage at rest in the frame of the level set."""
+    is_driven: bool = False
+    """True if the body follows a path, so that no contact moves it."""
 
 
 class PairContactDetector:
@@ -89,7 +91,7 @@ class PairContactDetector:
 
     def body_pairs(self, positions: np.ndarray) -> list[tuple[int, int]]:
         """Return the ordered pairs (a, b) of bodies whose inflated boxes overlap at ``positions`` (N, 3), both (a, b)
-        and (b, a), in ascending order.
+        and (b, a), in ascending order. Two driven bodies are no pair.
         """
         boxes = []
         for body, weights, part in zip(self.bodies, self._box_weights, self._split(positions), strict=True):
@@ -99,6 +101,8 @@ class PairContactDetector:
             boxes.append((corners.min(axis=0) - margin, corners.max(axis=0) + margin))
         lows, highs = (np.array(each).reshape(-1, 3) for each in zip(*boxes, strict=True))
         overlaps = np.all((lows[:, None] <= highs) & (lows <= highs[:, None]), axis=2)
+        driven = np.array([body.is_driven for body in self.bodies])
+        overlaps &= ~(driven[:, None] & driven)
         np.fill_diagonal(overlaps, False)
         return [(int(a), int(b)) for a, b in np.argwhere(overlaps)]
 
@@ -189,9 +193,17 @@ class PairContactDetector:
     def _gaps(self, a: int, b: int) -> np.ndarray:
         first, second = self._states[a], self._states[b]
         launch_cached(
+            kernels.close_tets_kernel,
+            first.close_tets.shape,
+            inputs=[first.close_tets.shape[1], second.hierarchy.id, *first.boxes],
+            outputs=[first.close_tets],
+            device=self.device,
+        )
+        points = [*first.points, first.tet_from_point]
+        launch_cached(
             kernels.pair_gaps_kernel,
             first.gaps.shape,
-            inputs=[*first.points, *second.shape, first.positions, second.positions],
+            inputs=[*points, *second.shape, first.close_tets, first.positions, second.positions],
             outputs=[first.gaps, first.tets_of(second)],
             device=self.device,
         )
@@ -246,14 +258,19 @@ class _DeformedBody:
             wp.array(mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device),
             wp.array(geometry.weights, dtype=Vec4, device=device),
         ]
+        self.tet_from_point = wp.array(geometry.tet_from_point, dtype=int, device=device)
+        self.close_tets = zeros((1, len(mesh.tets)), bool, device)
+        """Buffer for the tetrahedra that are close to another body."""
         self.positions = wp.array(mesh.nodes[None], dtype=Vec3, device=device)
         self._tets = wp.array(mesh.tets, dtype=wp.vec4i, device=device)
-        self._lowers, self._uppers = (empty(len(mesh.tets), wp.vec3, device) for _ in range(2))
+        self.boxes = [empty(len(mesh.tets), wp.vec3, device) for _ in range(2)]
+        """Lower and upper corners of the inflated boxes of the tetrahedra."""
         self._compute_boxes()
-        self._hierarchy = wp.Bvh(self._lowers, self._uppers, groups=zeros(len(mesh.tets), int, device))
+        lowers, uppers = self.boxes
+        self.hierarchy = wp.Bvh(lowers, uppers, groups=zeros(len(mesh.tets), int, device))
         rest = wp.array(body.rest_positions[None], dtype=Vec3, device=device)
         level_set = body.level_set
-        self.shape = [self._tets, rest, self._hierarchy.id, level_set.lattice, level_set.on_device(device)]
+        self.shape = [self._tets, rest, self.hierarchy.id, level_set.lattice, level_set.on_device(device)]
         self.gaps = zeros((1, len(geometry.weights)), real, device)
         self._tets_of: dict[_DeformedBody, wp.array] = {}
 
@@ -261,7 +278,7 @@ class _DeformedBody:
         """Move the nodes to ``positions`` (N, 3)."""
         copy_into(self.positions, positions[None])
         self._compute_boxes()
-        self._hierarchy.refit()
+        self.hierarchy.refit()
 
     def tets_of(self, other: _DeformedBody) -> wp.array:
         """Return the buffer (1, P) for the tetrahedron of ``other`` at each point, initially -1."""
@@ -275,7 +292,7 @@ class _DeformedBody:
             kernels.tet_boxes_kernel,
             (1, len(self._tets)),
             inputs=inputs,
-            outputs=[self._lowers, self._uppers],
+            outputs=self.boxes,
             device=self.device,
         )
 

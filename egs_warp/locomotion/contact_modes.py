@@ -268,7 +268,7 @@ class ModeRegion:
         """Return the region of ``modes``, or None if the equations of its contact forces are singular."""
         m, mu = program.activation_count, program.friction
         stick, slide, free = (np.flatnonzero(modes.kind == kind) for kind in (STICK, SLIDE, FREE))
-        forces = _forces(program, modes, stick, slide)
+        forces = forces_in_modes(program.rows, program.offset, mu, modes)
         if forces is None:
             return None
         # x = (a, f) as an affine function of the activations, with the constant in the last column.
@@ -307,28 +307,39 @@ class ModeRegion:
         )
 
 
-def _forces(program: CoulombProgram, modes: ContactModes, stick: np.ndarray, slide: np.ndarray) -> np.ndarray | None:
-    """Return the contact forces (3n, m + 1) as an affine function of the activations, with the constant in the last
-    column. They keep sticking contacts at rest and sliding contacts closed. None if their equations are singular."""
-    m, n = program.activation_count, program.contact_count
+def forces_in_modes(rows: np.ndarray, offset: np.ndarray, friction: float, modes: ContactModes) -> np.ndarray | None:
+    """Return the contact forces (3n, m + 1) as an affine function of m other unknowns, with the constant in the last
+    column. They keep sticking contacts at rest and sliding contacts closed.
+
+    Args:
+        rows: (3n, m + 3n) derivative of the contact velocities with respect to the m unknowns, then the forces.
+        offset: (3n,) contact velocities at zero.
+        friction: Coulomb coefficient.
+        modes: modes of the n contacts.
+
+    Returns:
+        The forces, or None if their equations are singular.
+    """
+    n, m = len(rows) // 3, rows.shape[1] - len(rows)
+    stick, slide = np.flatnonzero(modes.kind == STICK), np.flatnonzero(modes.kind == SLIDE)
     held = np.concatenate([(3 * stick[:, None] + np.arange(3)).ravel(), 3 * slide])
     # Map from the solved components, each of which keeps one velocity at zero, to all forces. The friction of a sliding
     # contact is proportional to its normal force.
     spread = np.zeros((3 * n, len(held)))
     spread[held, np.arange(len(held))] = 1.0
     normals = np.arange(3 * len(stick), len(held))
-    spread[3 * slide + 1, normals], spread[3 * slide + 2, normals] = -program.friction * modes.slip[slide].T
+    spread[3 * slide + 1, normals], spread[3 * slide + 2, normals] = -friction * modes.slip[slide].T
     if len(held) == 0:
         return np.zeros((3 * n, m + 1))
-    rows = program.rows[held]
-    operator = rows[:, m:] @ spread
+    held_rows = rows[held]
+    operator = held_rows[:, m:] @ spread
     diagonal = operator.diagonal()
     operator[np.diag_indices_from(operator)] += kernels.DELASSUS_REGULARIZATION * np.abs(diagonal).mean()
     factor, pivots, _ = _getrf(operator)
     sizes = np.abs(factor.diagonal())
     if not sizes.min() > _MIN_PIVOT * sizes.max():
         return None
-    solved, _ = _getrs(factor, pivots, np.column_stack([rows[:, :m], program.offset[held]]))
+    solved, _ = _getrs(factor, pivots, np.column_stack([held_rows[:, :m], offset[held]]))
     return -(spread @ solved)
 
 

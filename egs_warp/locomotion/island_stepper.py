@@ -1,8 +1,9 @@
 """The step of an island, that is, of bodies that may touch each other: planned one by one and solved together.
 
-The QP of each creature has its own activations and the contact forces of the whole island as unknowns, so the other
-bodies yield to it as in the solve. Plans are made in the order of the bodies (Gauss-Seidel): the plan of a creature
-uses the new activations of the creatures before it, and the previous activations of those after it.
+The unknowns of the QP of each creature are its activations and the forces of the contacts that it touches. The other
+contacts keep their predicted modes (``other_contacts``), so the other bodies yield to the creature. Plans are made in
+the order of the bodies (Gauss-Seidel): the plan of a creature uses the new activations of the creatures before it, and
+the previous activations of those after it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from egs_warp.contact.island_newton import IslandLinearizer
 from egs_warp.contact.newton import ContactLinearization
 from egs_warp.contact.pair_contact import PairContactDetector
 from egs_warp.fem.body import BodyState
+from egs_warp.fem.driven_step import DrivenStep, PathDrive, step_of
 from egs_warp.fem.island_problem import IslandProblem
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.linear_step import PredictedStep
@@ -71,6 +73,7 @@ class IslandStepper:
         steppers: Sequence[LocomotionStepper],
         pairs: PairContactDetector,
         frictions: np.ndarray,
+        drives: Sequence[PathDrive | None],
     ) -> None:
         """Make the stepper of some bodies of a world.
 
@@ -79,11 +82,13 @@ class IslandStepper:
             steppers: stepper of each of the k bodies.
             pairs: detector of the contacts between them.
             frictions: (k, k) Coulomb coefficients between them.
+            drives: drive of each body that follows a path, None for others.
         """
-        self.members, self.steppers = tuple(members), tuple(steppers)
+        self.members, self.steppers, self.drives = tuple(members), tuple(steppers), tuple(drives)
         with_ground = np.array([[stepper.geometry.friction] for stepper in steppers])
         detectors = tuple(stepper.detector for stepper in steppers)
-        self.contacts = IslandContacts(detectors, pairs, np.hstack([frictions, with_ground]))
+        driven = frozenset(body for body, drive in enumerate(drives) if drive is not None)
+        self.contacts = IslandContacts(detectors, pairs, driven, np.hstack([frictions, with_ground]))
         self.solver = IslandSolver(
             steppers[0].detector,
             steppers[0].selector,
@@ -184,8 +189,8 @@ class IslandStepper:
         """Detect the contacts of a step and collect its inputs."""
         problem = IslandProblem(
             tuple(
-                StepProblem(stepper.body, state, dt, stepper.settings.drag)
-                for stepper, state in zip(self.steppers, states, strict=True)
+                step_of(stepper.body, state, dt, stepper.settings.drag, drive)
+                for stepper, state, drive in zip(self.steppers, states, self.drives, strict=True)
             )
         )
         previous, forces = self._previous_contacts(memories)
@@ -317,6 +322,7 @@ class IslandStepper:
             zip(problem.problems, problem.split(ends), problem.split(result.velocities), strict=True)
         ):
             chosen, own_contacts = self._contacts_of(body, keys, contacts, problem)
+            is_driven = isinstance(own, DrivenStep)
             spin = own.momentum_correction(own.internal_gradient(velocities, tensions[body]))
             plan = plans[body]
             reports.append(
@@ -333,6 +339,7 @@ class IslandStepper:
                     newton_iterations=result.iterations,
                     converged=result.converged,
                     added_spin=float(np.linalg.norm(spin)),
+                    drive=own.drive(own_contacts.nodal_forces(forces[chosen])) if is_driven else None,
                     milliseconds=clock.milliseconds,
                 )
             )

@@ -117,9 +117,11 @@ class LinearStep:
 
     def of_coordinates(self, coordinates: slice) -> LinearStep:
         """Return the linear step of some of the ``coordinates`` alone."""
-        if coordinates == slice(None):
-            return self
         return LinearStep(self.velocities[coordinates], self.torques)
+
+    def of_unknowns(self, unknowns: np.ndarray) -> LinearStep:
+        """Return the linear step as a function of the ``unknowns`` (j,) alone; the others are zero."""
+        return LinearStep(self.velocities[:, [*unknowns.tolist(), -1]], self.torques[:, unknowns])
 
     def objective_quadratic(self, objectives: Sequence[Objective]) -> Callable[[], np.ndarray]:
         """Start computing the quadratic form of the weighted squares of ``objectives``; it may run asynchronously on a

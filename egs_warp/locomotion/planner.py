@@ -17,6 +17,7 @@ from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.contact_modes import CoulombProgram, PredictedContact
 from egs_warp.locomotion.linear_step import LinearStep, PredictedStep, StepLinearizer
 from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.other_contacts import OtherContacts, contacts_of_nodes
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.step_cost import EffortModel, QuadraticCost, effort_cost, objectives_cost
 from egs_warp.locomotion.strategies import search_program
@@ -48,6 +49,12 @@ class StepProgram:
     weights."""
     contact_velocities: np.ndarray
     """(3n, k + 1) m/s, W times the velocities of ``linear`` (Eq. 8)."""
+    others: OtherContacts | None = None
+    """Contacts that the QP does not contain; None if it contains all contacts."""
+
+    def contact_forces(self, x: np.ndarray) -> np.ndarray:
+        """Return the forces (n, 3) of all contacts, body weights, at the solution ``x`` of the QP."""
+        return x[self.program.activation_count :].reshape(-1, 3) if self.others is None else self.others.all_forces(x)
 
 
 @dataclass(frozen=True)
@@ -121,7 +128,7 @@ class StepPlanner:
             return Plan(last, predicted.velocities, predicted.forces, result.qp_count, result.infeasible)
         activations = (self.synergies.members @ result.x[:m]) * self.muscles.bounds
         contact_free = program.contact_velocities[:, -1] + program.contact_velocities[:, :m] @ result.x[:m]
-        qp_forces = self.body.weight * result.x[m:].reshape(-1, 3)
+        qp_forces = self.body.weight * program.contact_forces(result.x)
         forces, _ = predicted.linearization.solve_coulomb(contact_free, predicted.normal_bias, self.friction, qp_forces)
         end = program.linear.end_velocities(np.append(result.x[:m], forces / self.body.weight))
         velocities = end.reshape(predicted.velocities.shape)
@@ -141,22 +148,36 @@ class StepPlanner:
         linear, effort_model = self.linear_steps.linearize(
             predicted, lambda: EffortModel.of(problem, predicted_velocities, self.factors)
         )
+        slip = contacts.contact_velocities(predicted.velocities.ravel()).reshape(-1, 3) / speed
+        forces, others, own, velocities = predicted.forces / weight, None, linear, None
+        if predicted.body is not None:
+            own, velocities = linear.of_coordinates(predicted.coordinates), linear.contact_velocities(contacts)
+            retained = contacts_of_nodes(contacts, predicted.nodes)
+            others = OtherContacts.of(retained, *self._contact_rows(velocities, predicted), self.friction, forces)
+        if others is not None:
+            own, contacts = own.of_unknowns(others.unknowns), contacts.of_entries(others.retained)
+            slip, forces = slip[others.retained], forces[others.retained]
         previous = self.synergies.mean(last / self.muscles.bounds)
-        own = linear.of_coordinates(predicted.coordinates)
         finish_objectives = objectives_cost(problem, own, contacts.with_nodes_of(predicted.nodes), objectives, speed)
-        activation = self._activation_cost(problem, predicted_velocities, previous, linear.count)
+        activation = self._activation_cost(problem, predicted_velocities, previous, own.count)
         effort = effort_cost(problem, own, predicted_velocities.ravel(), effort_model)
         cost = finish_objectives() + effort + activation
-        contact_velocities = linear.contact_velocities(contacts)
-        rows, offset = contact_velocities[:, :-1] / speed, contact_velocities[:, -1] / speed
-        offset[::3] += predicted.normal_bias / speed
+        # The objectives of a single body may be computed on a device, so its contact velocities come after them.
+        velocities = linear.contact_velocities(contacts) if velocities is None else velocities
+        rows, offset = self._contact_rows(velocities, predicted)
+        if others is not None:
+            rows, offset = others.contact_rows(rows, offset)
         bounds = self.activation_bounds(previous, problem.dt)
-        coulomb_program = CoulombProgram(cost.P, cost.q, cost.constant, rows, offset, self.friction, *bounds)
-        slip = contacts.contact_velocities(predicted.velocities.ravel()).reshape(-1, 3) / speed
+        program = CoulombProgram(cost.P, cost.q, cost.constant, rows, offset, self.friction, *bounds)
         start = self.synergies.mean(predicted.activations / self.muscles.bounds)
-        return StepProgram(
-            coulomb_program, PredictedContact(start, predicted.forces / weight, slip), linear, contact_velocities
-        )
+        return StepProgram(program, PredictedContact(start, forces, slip), linear, velocities, others)
+
+    def _contact_rows(self, velocities: np.ndarray, predicted: PredictedStep) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``StepProgram.contact_velocities`` in the units of the QP, with the bias of normal velocities: the
+        derivative (3n, k) and the offset (3n,)."""
+        rows, offset = velocities[:, :-1] / self.body.speed_unit, velocities[:, -1] / self.body.speed_unit
+        offset[::3] += predicted.normal_bias / self.body.speed_unit
+        return rows, offset
 
     def activation_bounds(self, previous: Any, dt: float) -> tuple[Any, Any]:
         """Return lower and upper bounds (..., m) of the activations after ``dt`` s from ``previous`` (..., m), an array

@@ -69,10 +69,14 @@ class Recorder:
         Args:
             reports: their reports, in order.
             request_digest: ``replay.digest`` of the objectives and of ``kick``; only read when a run is continued.
-            kick: (N, 3) m/s, velocities that external pushes added to the nodes at the start of the step.
+            kick: (N, 3) m/s, velocities that external pushes added to the nodes at the start of the step. The drives
+                of the reports are recorded as kicks, too.
         """
         if kick is not None:
             self._kicks.append((self._steps + len(self._reports), kick))
+        drives = enumerate(report.drive for report in reports)
+        first = self._steps + len(self._reports)
+        self._kicks += [(first + index, drive) for index, drive in drives if drive is not None]
         self._reports += reports
         self._requests += [(self._requested_steps, request_digest)] * len(reports)
         self._requested_steps += 1

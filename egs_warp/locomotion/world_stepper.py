@@ -14,6 +14,7 @@ import numpy as np
 from egs_warp.contact.islands import find_islands
 from egs_warp.contact.pair_contact import PairBody, PairContactDetector
 from egs_warp.fem.body import BodyState
+from egs_warp.fem.driven_step import DrivenStep, PathDrive, step_of
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.island_stepper import IslandStepper
 from egs_warp.locomotion.objectives import AnyObjective
@@ -40,6 +41,12 @@ class WorldBody:
     """Level set of the captured shape."""
     rest_positions: np.ndarray
     """(N, 3) m, nodes of the cage at rest in the frame of the level set."""
+    drive: PathDrive | None = None
+    """Drive of a prop that follows a path; None if forces move the body."""
+
+    def step(self, state: BodyState, dt: float) -> StepProblem:
+        """Return the step of ``dt`` s from ``state``."""
+        return step_of(self.stepper.body, state, dt, self.stepper.settings.drag, self.drive)
 
 
 class WorldStepper:
@@ -59,7 +66,10 @@ class WorldStepper:
         """(k, k) Coulomb coefficients between the bodies."""
         self.pairs = PairContactDetector(
             [
-                PairBody(body.stepper.geometry, body.stepper.selector, body.level_set, body.rest_positions)
+                PairBody(
+                    *(body.stepper.geometry, body.stepper.selector, body.level_set, body.rest_positions),
+                    is_driven=body.drive is not None,
+                )
                 for body in bodies
             ],
             device="cpu",
@@ -104,6 +114,9 @@ class WorldStepper:
                     done[body] = [report]
             elif len(members) == 1:
                 body = members[0]
+                if self.bodies[body].drive is not None:
+                    done[body] = [self._driven(body, states[body], dt)]
+                    continue
                 memory = _with_ground_only(memories[body], self.pairs.point_counts[body])
                 _, _, done[body] = self.bodies[body].stepper.advance(states[body], memory, objectives[body], dt)
             else:
@@ -131,10 +144,32 @@ class WorldStepper:
                 or not np.array_equal(last.forces, memories[body].forces)
                 or not np.array_equal(last.state.positions, state.positions)
                 or not np.array_equal(last.state.velocities, state.velocities)
+                or self._will_be_driven(body, state, dt)
             ):
                 return None
             reports.append(replace(last, state=replace(state, time=state.time + dt), newton_iterations=0))
         return reports
+
+    def _will_be_driven(self, body: int, state: BodyState, dt: float) -> bool:
+        """Return True if the path of a body moves it in the step."""
+        step = self.bodies[body].step(state, dt)
+        return isinstance(step, DrivenStep) and not np.array_equal(step.end, state.positions)
+
+    def _driven(self, body: int, state: BodyState, dt: float) -> StepReport:
+        """Return the report of a driven body that touches no other body."""
+        step = self.bodies[body].step(state, dt)
+        assert isinstance(step, DrivenStep)
+        contacts = self.bodies[body].stepper.detector.contact_set(np.zeros(0, int), state.positions)
+        none = np.zeros(0)
+        return StepReport(
+            *(BodyState(step.end, step.rigid_guess, state.time + dt), dt, contacts, np.zeros((0, 3)), none, 0.0, none),
+            qp_count=0,
+            qp_infeasible=0,
+            newton_iterations=0,
+            converged=True,
+            added_spin=0.0,
+            drive=step.drive(np.zeros_like(state.positions)),
+        )
 
     def _count_quiet_steps(self, done: Sequence[Sequence[StepReport]]) -> None:
         for body, reports in enumerate(done):
@@ -148,10 +183,7 @@ class WorldStepper:
     def islands(self, states: Sequence[BodyState], dt: float) -> list[tuple[int, ...]]:
         """Return the islands of a step of ``dt`` s, in the order of their first bodies. An island is a set of bodies
         that overlaps of their inflated boxes at the end of a ballistic motion connect."""
-        ends = [
-            StepProblem(body.stepper.body, state, dt).ballistic_positions
-            for body, state in zip(self.bodies, states, strict=True)
-        ]
+        ends = [body.step(state, dt).ballistic_positions for body, state in zip(self.bodies, states, strict=True)]
         overlaps = self.pairs.body_pairs(np.concatenate(ends))
         roots = find_islands(len(self.bodies), np.array(overlaps, int).reshape(-1, 2))
         return [tuple(np.flatnonzero(roots == root).tolist()) for root in np.unique(roots)]
@@ -159,9 +191,8 @@ class WorldStepper:
     def _island(self, members: tuple[int, ...]) -> IslandStepper:
         if members not in self._islands:
             steppers = [self.bodies[i].stepper for i in members]
-            self._islands[members] = IslandStepper(
-                members, steppers, self.pairs.subset(members), self.frictions[np.ix_(members, members)]
-            )
+            frictions, drives = self.frictions[np.ix_(members, members)], [self.bodies[i].drive for i in members]
+            self._islands[members] = IslandStepper(members, steppers, self.pairs.subset(members), frictions, drives)
         return self._islands[members]
 
 

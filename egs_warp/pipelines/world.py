@@ -12,7 +12,9 @@ import numpy as np
 from egs_warp.contact.detection import ContactDetector
 from egs_warp.contact.terrain import Solid, surface_above
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
+from egs_warp.fem.driven_step import PathDrive
 from egs_warp.geometry.body_frame import GROUND
+from egs_warp.geometry.rigid_path import RigidPath
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.pipelines.captured_body import CapturedBody, checked_friction
@@ -41,6 +43,8 @@ class PlacedBody:
     """Name of the body, unique in its world."""
     body: Creature | Prop
     """The body at its place, at rest on the ground of the world."""
+    path: RigidPath | None = None
+    """Path along which a prop is driven; None if forces move the body."""
 
 
 class World:
@@ -80,6 +84,7 @@ class World:
         above: float = 0.0,
         heading: float | None = None,
         name: str | None = None,
+        path: RigidPath | None = None,
     ) -> PlacedBody:
         """Place a body on the ground.
 
@@ -90,17 +95,21 @@ class World:
             heading: Direction in which a creature faces, degrees counter-clockwise from the x axis of the world, seen
                 from above. A prop is turned by this angle. None keeps the orientation of the body's own frame.
             name: Name for messages and files; None numbers the bodies: ``creature-1``, ``prop-2``.
+            path: Path that a prop follows from its place, whatever pushes it, such as a lift. It passes through the
+                ground and solids of the world, but carries and pushes other bodies.
 
         Returns:
             The placed body, its key in the arguments of ``simulate`` and in the result.
 
         Raises:
             UserError: The name or the position is invalid, the name is taken, the body is on a GPU, the ground of the
-                body is not a level plane, or the body overlaps a solid or another body.
+                body is not a level plane, the body overlaps a solid or another body, or a creature has a path.
         """
         kind = "prop" if isinstance(body, Prop) else "creature"
         name = f"{kind}-{len(self._members) + 1}" if name is None else name
         self._check_name(name)
+        if path is not None and isinstance(body, Creature):
+            raise UserError(f"{name}: it is a creature, which moves with its muscles; give a path to props only")
         numbers = [*at, above, heading or 0.0]
         # Not "any above the maximum", because NaN must be rejected, too.
         if not np.abs(numbers).max() <= _MAX_POSITION or above < 0.0:
@@ -122,7 +131,7 @@ class World:
         captured_heading = _heading_of(body) if isinstance(body, Creature) else 0.0
         placed = body.moved((*at, lift + above), 0.0 if heading is None else heading - captured_heading)
         placed = replace(placed, stepper=self._own_stepper(placed), solids=surfaces)
-        member = PlacedBody(name, placed)
+        member = PlacedBody(name, placed, path)
         self._check_place(member)
         for other in self._members.values():
             check_apart(other, member)
@@ -151,8 +160,12 @@ class World:
 
     def stepper(self) -> WorldStepper:
         """Return the stepper of all bodies. The first call for a body computes its level set, which takes seconds."""
-        bodies = [member.body for member in self.members]
-        return WorldStepper([WorldBody(body.stepper, body.shape.level_set, body.mesh.nodes) for body in bodies])
+        bodies = []
+        for member in self.members:
+            body, path = member.body, member.path
+            drive = None if path is None else PathDrive(path, body.start.positions)
+            bodies.append(WorldBody(body.stepper, body.shape.level_set, body.mesh.nodes, drive))
+        return WorldStepper(bodies)
 
     def _check_name(self, name: str) -> None:
         if not name or not all(letter.isalnum() or letter in "-_" for letter in name):

@@ -12,6 +12,7 @@ import numpy as np
 from egs_warp.contact.terrain import Solid
 from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.rigid_path import RigidPath
 from egs_warp.io.capture import read_capture
 from egs_warp.io.yaml_file import check_schema, line_of, read_yaml
 from egs_warp.motions.push import Push, read_pushes
@@ -23,7 +24,7 @@ from egs_warp.short_repr import short_repr
 
 SCHEMA = "world.schema.json"
 """Schema of world files, in the package ``egs_warp.io``."""
-_PROP_KEYS = ("density",)
+_PROP_KEYS = ("density", "path", "repeat")
 _CREATURE_KEYS = ("nodes", "front", "motion", "push")
 """Keys that only props, and only creatures, have."""
 _MAKER_KEYS = ("capture", "prop", "up", "front", "plane", "metres_per_unit", "height", "nodes", "density")
@@ -94,6 +95,7 @@ def read_world(
                 above=entry.get("above", 0.0),
                 heading=entry.get("heading"),
                 name=name,
+                path=_path(entry) if "path" in entry else None,
             )
         except UserError as error:
             raise UserError(f"{where}: {error}") from error
@@ -181,6 +183,22 @@ def _make_body(folder: Path, entry: Mapping[str, Any], device: str | None) -> Cr
     nodes = {"nodes": entry["nodes"]} if "nodes" in entry else {}
     options = CreatureOptions(front=entry.get("front"), **scale, **nodes)
     return make_creature(cloud, up=up, plane=plane, options=options)
+
+
+def _path(entry: Mapping[str, Any]) -> RigidPath:
+    """Return the path of an entry, whose points are given like the place of a body; a key that a point does not have
+    keeps its value."""
+    place = {"at": (0.0, 0.0), "above": 0.0, "heading": 0.0} | {
+        key: entry[key] for key in ("at", "above", "heading") if key in entry
+    }
+    start, times, shifts, turns = dict(place), [], [], []
+    for point in entry["path"]:
+        place |= {key: value for key, value in point.items() if key != "time"}
+        times.append(point["time"])
+        moved = np.subtract(place["at"], start["at"])
+        shifts.append((*moved.tolist(), place["above"] - start["above"]))
+        turns.append(place["heading"] - start["heading"])
+    return RigidPath(times, shifts, turns, repeat=entry.get("repeat", False))
 
 
 def _unused_name(world: World, name: str) -> str:

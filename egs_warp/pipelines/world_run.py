@@ -11,6 +11,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
+from egs_warp.geometry.rigid_path import RigidPath
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.rollout import FRAME_RATE, BodyRun, RolloutResult
 from egs_warp.locomotion.stepper import StepReport
@@ -105,15 +106,19 @@ class WorldRun:
 
 
 class PassiveMotion:
-    """Motion of a prop: it has no objectives and detects when the prop is at rest."""
+    """Motion of a prop: it has no objectives and detects when the prop is at rest, or at the end of its path."""
 
-    def __init__(self, prop: Prop) -> None:
-        self._rest = RestDetector(prop.body)
+    def __init__(self, prop: Prop, path: RigidPath | None) -> None:
+        self._rest, self._path_end = RestDetector(prop.body), None if path is None else path.end
         self.is_at_rest = False
-        """True once the fastest node has been slow for a while (``RestDetector``)."""
+        """True once the fastest node has been slow for a while (``RestDetector``), or at the end of a path. A path that
+        is repeated has no end, so the run does not wait for it."""
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Update ``is_at_rest``; return no objectives."""
+        if self._path_end is not None:
+            self.is_at_rest = state.time >= self._path_end
+            return []
         fastest = int(np.argmax(np.linalg.norm(state.velocities, axis=1)))
         self.is_at_rest = self._rest.update(state.velocities[fastest], state.time)
         return []
@@ -175,11 +180,12 @@ def simulate_world(
                 BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame, front=front, kicks=kicks)
             )
         else:
-            motion = passive[name] = PassiveMotion(body)
+            motion = passive[name] = PassiveMotion(body, member.path)
             runs.append(BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame))
     settling = round(_PROP_TIME * FRAME_RATE) if passive and frames is None else 0
     limit = max([performer.frame_limit for performer in performers.values()], default=0) + settling
-    limit = limit if frames is None else frames - 1
+    path_ends = [member.path.end for member in world.members if member.path is not None]
+    limit = max([limit, *(round(end * FRAME_RATE) + settling for end in path_ends)]) if frames is None else frames - 1
 
     def is_over() -> bool:
         at_rest = all(motion.is_at_rest for motion in passive.values())

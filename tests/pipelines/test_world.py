@@ -12,6 +12,9 @@ from egs_warp.assets import pawn
 from egs_warp.contact.terrain import Solid
 from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.rigid_path import RigidPath
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.simulated_run import simulate
 from egs_warp.pipelines.world import World
@@ -103,3 +106,18 @@ def test_overlapping_bodies_are_refused() -> None:
         world.add(prop(), at=(0.15, 0.0), name="king")
     world.add(prop(), at=(0.6, 0.0), name="king")
     assert [placed.name for placed in world.members] == ["box", "king"]
+
+
+def test_a_driven_prop_follows_its_path_and_its_balances_hold() -> None:
+    world = World()
+    path = RigidPath([0.2, 0.4], [(0.0, 0.0, 0.2), (0.3, 0.0, 0.0)], [0.0, 90.0])
+    lift = world.add(prop(), heading=0.0, path=path)
+    run = simulate_world(world, {})[lift]
+    t = run.trajectory
+    assert t.time[-1] >= 0.4
+    assert t.positions[-1] == pytest.approx(path.moved(t.positions[0], 0.4), abs=1e-12)
+    result = audit(t)
+    assert result.momentum_residual < 1e-12 and result.angular_momentum_residual < 1e-12
+    assert energy_balance(t).max_residual < 1e-9
+    with pytest.raises(UserError, match=r"^creature-2: it is a creature, which moves with its muscles"):
+        world.add(coarse_pawn(), path=path)

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from egs_warp.assets import pawn
 from egs_warp.errors import UserError
+from egs_warp.io.ply import write_ply
 from egs_warp.pipelines.world_file import box, ramp, read_world
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -43,3 +45,19 @@ def test_a_box_and_a_ramp_have_their_size() -> None:
     slope = ramp((0.0, 0.0), 2.0, 1.0, 0.5)
     heights = [slope.distance_along(np.array([x, 0.0, 0.0]), UP) for x in (-0.1, 1.0, 1.9, 2.1)]
     assert heights == pytest.approx([-0.025, 0.25, 0.475, -np.inf])
+
+
+def test_the_points_of_a_path_are_places_and_keep_what_they_leave_out(tmp_path: Path) -> None:
+    scene = pawn(gaussian_count=3000, device="cpu")
+    write_ply(tmp_path / "pawn.ply", scene.cloud)
+    path = tmp_path / "world.yaml"
+    path.write_text(
+        "bodies:\n- {capture: pawn.ply, up: z, prop: true, at: [1, 2], above: 0.1, heading: 10, repeat: true,\n"
+        "   path: [{time: 1, above: 0.5}, {time: 2, at: [3, 2], heading: 100}, {time: 3, at: [1, 2], above: 0.1,"
+        " heading: 10}]}\n"
+    )
+    (placed,) = read_world(path, device="cpu").world.members
+    given = placed.path
+    assert given is not None and given.repeat and list(given.times) == [1, 2, 3]
+    np.testing.assert_allclose(given.shifts, [[0.0, 0.0, 0.4], [2.0, 0.0, 0.4], [0.0, 0.0, 0.0]])
+    assert given.turns == [0.0, 90.0, 0.0]

@@ -124,16 +124,37 @@ def tet_boxes_kernel(
 
 
 @wp.kernel
+def close_tets_kernel(
+    # Model:
+    tet_count: int,
+    boxes: wp.uint64,
+    # In:
+    lowers: wp.array[wp.vec3],
+    uppers: wp.array[wp.vec3],
+    # Out:
+    close_out: wp.array2d[bool],
+):
+    """Determine which tetrahedra of body a have a box that overlaps the box of a tetrahedron of body b."""
+    world, tet = wp.tid()
+    row = world * tet_count + tet
+    query = wp.bvh_query_aabb(boxes, lowers[row], uppers[row], wp.bvh_get_group_root(boxes, world))
+    candidate = int(0)
+    close_out[world, tet] = wp.bvh_query_next(query, candidate)
+
+
+@wp.kernel
 def pair_gaps_kernel(
     # Model:
     nodes: wp.array[wp.vec4i],
     weights: wp.array[Vec4],
+    tet_from_point: wp.array[int],
     tets: wp.array[wp.vec4i],
     rest: wp.array2d[Vec3],
     boxes: wp.uint64,
     lattice: LevelSetLattice,
     coefficients: wp.array[float],
     # In:
+    close: wp.array2d[bool],
     positions: wp.array2d[Vec3],
     other_positions: wp.array2d[Vec3],
     # Out:
@@ -141,11 +162,14 @@ def pair_gaps_kernel(
     tets_out: wp.array2d[int],
 ):
     """Compute the gap of each point of body a to body b, and the tetrahedron of b at the point. If no box of a
-    tetrahedron contains the point, they are infinite and -1.
+    tetrahedron contains the point, they are infinite and -1. Only points in ``close`` tetrahedra are tested.
     """
     world, point = wp.tid()
-    x = embedded_point(nodes[point], weights[point], positions, world)
-    tet = tet_at_point(x, world, tets, other_positions, boxes)
+    tet = int(-1)
+    x = Vec3()
+    if close[world, tet_from_point[point]]:
+        x = embedded_point(nodes[point], weights[point], positions, world)
+        tet = tet_at_point(x, world, tets, other_positions, boxes)
     gap = real(wp.inf)
     if tet >= 0:
         corners = tets[tet]

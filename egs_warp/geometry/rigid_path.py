@@ -1,0 +1,69 @@
+"""Prescribed rigid motion of a body: positions and turns at given times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from egs_warp.errors import UserError
+from egs_warp.short_repr import short_repr
+
+
+@dataclass(frozen=True)
+class RigidPath:
+    """Rigid motion of a body that follows a path whatever pushes it, such as a lift or a swinging door.
+
+    The body starts at rest at time 0 and passes through the given points. It moves from one to the next with a cubic
+    polynomial of time and is at rest at each point.
+    """
+
+    __repr__ = short_repr
+
+    times: Sequence[float]
+    """(K,) s, time of each point, positive and ascending."""
+    shifts: Sequence[Sequence[float]]
+    """(K, 3) m, translation from the start to each point, in the axes of the world."""
+    turns: Sequence[float] | None = None
+    """(K,) degrees, rotation from the start to each point about the vertical through the centre of mass,
+    counter-clockwise seen from above; None does not turn the body."""
+    repeat: bool = False
+    """True to repeat the path for ever; the last point must be the start."""
+
+    def __post_init__(self) -> None:
+        times, shifts, turns = self._arrays()
+        if len(times) < 2 or not (np.diff(times) > 0.0).all() or not np.isfinite(times).all():
+            raise UserError("path: give at least one point, and ascending times above 0 s")
+        if len(shifts) != len(times) or len(turns) != len(times):
+            raise UserError("path: give a shift, and if any a turn, for each time")
+        if not (np.isfinite(shifts).all() and np.isfinite(turns).all()):
+            raise UserError("path: give finite shifts and turns")
+        if self.repeat and (shifts[-1].any() or turns[-1] % 360.0 != 0.0):
+            raise UserError("path: it is repeated, but does not end where it starts; add the start as its last point")
+
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return times (K + 1,), shifts (K + 1, 3) and turns (K + 1,) with the start."""
+        turns = np.zeros(len(self.times)) if self.turns is None else np.asarray(self.turns, float)
+        shifts = [np.zeros(3), *(np.asarray(shift, float) for shift in self.shifts)]
+        if any(shift.shape != (3,) for shift in shifts):
+            raise UserError("path: give three numbers for each shift")
+        return np.append(0.0, self.times), np.array(shifts), np.append(0.0, turns)
+
+    @property
+    def end(self) -> float:
+        """Time of the last point, s; 0 for a path that is repeated."""
+        return 0.0 if self.repeat else float(self.times[-1])
+
+    def moved(self, positions: np.ndarray, time: float) -> np.ndarray:
+        """Return ``positions`` (N, 3) m, those of equal masses at time 0, at the ``time`` in s."""
+        times, shifts, turns = self._arrays()
+        time = time % times[-1] if self.repeat else min(time, times[-1])
+        after = int(np.clip(np.searchsorted(times, time, side="right"), 1, len(times) - 1))
+        s = (time - times[after - 1]) / (times[after] - times[after - 1])
+        s = s * s * (3.0 - 2.0 * s)
+        turn, shift = (each[after - 1] + s * (each[after] - each[after - 1]) for each in (turns, shifts))
+        centre = positions.mean(axis=0)
+        rotation = Rotation.from_rotvec([0.0, 0.0, np.radians(turn)])
+        return centre + rotation.apply(positions - centre) + shift

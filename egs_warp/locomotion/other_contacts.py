@@ -1,0 +1,84 @@
+"""Contacts of an island that the planned body does not touch, eliminated from its QP.
+
+These contacts keep their predicted modes in the plan, so their forces are an affine function of the other unknowns:
+the other bodies yield to the planned body as far as their own contacts let them. The solve of the step computes the
+forces of all contacts again from Coulomb's law.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.contact.contact_set import ContactSet
+from egs_warp.locomotion.contact_modes import ContactModes, forces_in_modes
+
+
+@dataclass(frozen=True)
+class OtherContacts:
+    """Eliminated contacts of a QP with m activations and the forces of n contacts, in the units of the QP."""
+
+    retained: np.ndarray
+    """(p,) contacts of the planned body, whose forces stay unknown."""
+    others: np.ndarray
+    """(n - p,) eliminated contacts."""
+    forces: np.ndarray
+    """(3 (n - p), m + 3p + 1) their forces as an affine function of the remaining unknowns, the constant last."""
+
+    @classmethod
+    def of(
+        cls, retained: np.ndarray, rows: np.ndarray, offset: np.ndarray, friction: float, forces: np.ndarray
+    ) -> OtherContacts | None:
+        """Eliminate the contacts that are not in ``retained`` (p,).
+
+        Args:
+            retained: indices of the contacts of the planned body.
+            rows: (3n, m + 3n) derivative of all contact velocities with respect to the unknowns.
+            offset: (3n,) contact velocities at zero.
+            friction: Coulomb coefficient.
+            forces: (n, 3) predicted contact forces, which determine the modes.
+
+        Returns:
+            None if the equations of the eliminated forces are singular.
+        """
+        n = len(forces)
+        others = np.setdiff1d(np.arange(n), retained)
+        m = rows.shape[1] - 3 * n
+        of_others = _coordinates(others)
+        order = np.concatenate([np.arange(m), m + _coordinates(retained), m + of_others])
+        modes = ContactModes.of(forces[others], friction)
+        solved = forces_in_modes(rows[of_others][:, order], offset[of_others], friction, modes)
+        return None if solved is None else cls(retained, others, solved)
+
+    @property
+    def unknowns(self) -> np.ndarray:
+        """(m + 3p,) indices of the remaining unknowns among all."""
+        m = self.forces.shape[1] - 1 - 3 * len(self.retained)
+        return np.concatenate([np.arange(m), m + _coordinates(self.retained)])
+
+    def contact_rows(self, rows: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivative (3p, m + 3p) and the offset (3p,) of the velocities of the remaining contacts; ``rows``
+        and ``offset`` are those of all contacts, as in ``of``."""
+        own, m = rows[_coordinates(self.retained)], rows.shape[1] - len(rows)
+        mobility = own[:, m + _coordinates(self.others)]
+        yielding = mobility @ self.forces
+        return own[:, self.unknowns] + yielding[:, :-1], offset[_coordinates(self.retained)] + yielding[:, -1]
+
+    def all_forces(self, x: np.ndarray) -> np.ndarray:
+        """Return the forces (n, 3) of all contacts for the remaining unknowns ``x`` (m + 3p,)."""
+        forces = np.empty((len(self.retained) + len(self.others), 3))
+        forces[self.retained] = x[len(x) - 3 * len(self.retained) :].reshape(-1, 3)
+        forces[self.others] = (self.forces[:, :-1] @ x + self.forces[:, -1]).reshape(-1, 3)
+        return forces
+
+
+def contacts_of_nodes(contacts: ContactSet, nodes: slice) -> np.ndarray:
+    """Return the indices of the contacts that involve a node of ``nodes``."""
+    is_own = (contacts.nodes >= nodes.start) & (contacts.nodes < nodes.stop) & (contacts.weights != 0.0)
+    return np.flatnonzero(is_own.any(axis=1))
+
+
+def _coordinates(contacts: np.ndarray) -> np.ndarray:
+    """Return the indices (3k,) of the force components of ``contacts`` (k,)."""
+    return (3 * contacts[:, None] + np.arange(3)).ravel()
