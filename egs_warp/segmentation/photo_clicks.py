@@ -58,15 +58,16 @@ def with_photos(
 def picked_in_photos(spec: ClicksInPhotos, scene: SceneAbovePlane) -> ClicksInPhotos:
     """Return ``spec`` with the Gaussians that its point and clicks describe as ``picked``, and with only the certain
     hits of its clicks. Raises ``UserError`` if nothing of the object is above the plane."""
-    assert spec.surface is not None and spec.point is not None
+    surface, point = spec.surface, spec.point
+    assert surface is not None and point is not None
     solid = scene.is_opaque & (scene.heights > 0.0)
-    clicks = tuple(_certain(spec.surface, click) for click in spec.clicks)
+    clicks = tuple(_certain(surface, click) for click in spec.clicks)
     spec = replace(spec, clicks=clicks)
     if not any(click.inside for click in clicks) and solid.any():
         standing = np.flatnonzero(solid)
-        nearest = KDTree(scene.means[standing]).query(spec.point, k=min(_SEED_COUNT, len(standing)))[1]
-        clicks = (Click(spec.point, standing[np.ravel(nearest)]), *clicks)
-    found = object_of_clicks(spec.surface, clicks, scene.plane)
+        nearest = KDTree(scene.means[standing]).query(point, k=min(_SEED_COUNT, len(standing)))[1]
+        clicks = (Click(point, standing[np.ravel(nearest)]), *clicks)
+    found = object_of_clicks(surface, clicks, scene.plane)
     if not (found & solid).any():
         raise UserError(
             "object: nothing of it lies above the plane around the clicks; click on more of it, mark it with masks, or"

@@ -134,7 +134,7 @@ def _features(
     along = arms / np.maximum(np.linalg.norm(arms, axis=1), 1e-30)[:, None]
     normals = _outward_normals(cloud, nodes, links, cameras)
     bend = np.einsum("ij,ij->i", along, normals[second] - normals[first])
-    known = normals.any(axis=1)
+    known = np.linalg.norm(normals, axis=1) > 0.0
     both = known[first] & known[second]
     turn = np.where(both, 1.0 - np.einsum("ij,ij->i", normals[first], normals[second]), 0.0)
     bend = np.where(both, bend, 0.0)

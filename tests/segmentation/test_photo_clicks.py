@@ -105,9 +105,11 @@ def test_a_wide_hit_of_a_click_is_no_constraint(against_wall: GaussianCloud) -> 
     scales = against_wall.log_scales.numpy().copy()
     scales[BALL + 40] = np.log([0.4, 0.4, 0.01])
     wide = GaussianCloud.from_numpy(
-        *(getattr(against_wall, name).numpy() for name in ("means", "rotations")),
+        against_wall.means.numpy(),
+        against_wall.rotations.numpy(),
         scales,
-        *(getattr(against_wall, name).numpy() for name in ("opacity_logits", "sh")),
+        against_wall.opacity_logits.numpy(),
+        against_wall.sh.numpy(),
     )
     hit = Click(spec.clicks[0].point, np.append(spec.clicks[0].hits, BALL + 40))
     found = segment(wide, FLOOR, with_photos(wide, ObjectSpec.of_clicks([hit]), photos(9))).object_mask
