@@ -45,10 +45,10 @@ if TYPE_CHECKING:
     from egs_warp.motions.sequence import BodyMotion
     from egs_warp.motions.style import Style, read_style
     from egs_warp.pipelines.animate import AnimateOptions, animate
-    from egs_warp.pipelines.animate_world import WorldReport, write_world
+    from egs_warp.pipelines.animate_world import write_world
     from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
     from egs_warp.pipelines.job import Job
-    from egs_warp.pipelines.many import JobResult, simulate_many
+    from egs_warp.pipelines.many import JobResult, WorldJobResult, simulate_many
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
     from egs_warp.pipelines.prop import Prop, make_prop
     from egs_warp.pipelines.report import Report
@@ -58,6 +58,8 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.train_capture import TrainResult, train
     from egs_warp.pipelines.world import PlacedBody, World
     from egs_warp.pipelines.world_file import WorldScript, read_world
+    from egs_warp.pipelines.world_job import BodyOutcome, WorldJob
+    from egs_warp.pipelines.world_report import WorldReport
     from egs_warp.pipelines.world_run import WorldRun
     from egs_warp.render.autograd import render_torch
     from egs_warp.render.rasteriser import render_gaussians
@@ -110,10 +112,10 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "motions.sequence": ("BodyMotion",),
     "motions.style": ("Style", "read_style"),
     "pipelines.animate": ("AnimateOptions", "animate"),
-    "pipelines.animate_world": ("WorldReport", "write_world"),
+    "pipelines.animate_world": ("write_world",),
     "pipelines.creature": ("Creature", "CreatureOptions", "make_creature"),
     "pipelines.job": ("Job",),
-    "pipelines.many": ("JobResult", "simulate_many"),
+    "pipelines.many": ("JobResult", "WorldJobResult", "simulate_many"),
     "pipelines.simulated_run": ("SimulatedRun",),
     "pipelines.simulation": ("simulate",),
     "pipelines.prepare_scene": ("PreparedScene", "SceneOptions", "prepare_scene"),
@@ -123,6 +125,8 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "pipelines.train_capture": ("TrainResult", "train"),
     "pipelines.world": ("PlacedBody", "World"),
     "pipelines.world_file": ("WorldScript", "read_world"),
+    "pipelines.world_job": ("BodyOutcome", "WorldJob"),
+    "pipelines.world_report": ("WorldReport",),
     "pipelines.world_run": ("WorldRun",),
     "render.autograd": ("render_torch",),
     "render.rasteriser": ("render_gaussians",),
@@ -149,6 +153,7 @@ __all__ = [
     "AnimateOptions",
     "ArgumentError",
     "BodyMotion",
+    "BodyOutcome",
     "Box",
     "Camera",
     "Capture",
@@ -198,6 +203,8 @@ __all__ = [
     "UserError",
     "VideoWriter",
     "World",
+    "WorldJob",
+    "WorldJobResult",
     "WorldReport",
     "WorldRun",
     "WorldScript",

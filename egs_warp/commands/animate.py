@@ -214,7 +214,7 @@ def _animate(args: argparse.Namespace) -> int:
 
     if is_world(args.capture):
         check_run_folder(args.out, overwrite=args.overwrite, writes=("sheet.png", "report.json"))
-        return EXIT_NOT_AS_REQUESTED if animate_world(args) else 0
+        return run_animate(args)
     check_run_folder(args.out, overwrite=args.overwrite, writes=_WRITES)
     if args.config is not None and changed_capture(args.config, args.capture):
         print_note(f"{args.capture} differs from the capture of the run in {args.config}; the result will differ")
@@ -224,6 +224,8 @@ def _animate(args: argparse.Namespace) -> int:
 def run_animate(args: argparse.Namespace) -> int:
     """Run ``egs-warp animate`` with the output folder already checked; return the exit status."""
     try:
+        if is_world(args.capture):
+            return EXIT_NOT_AS_REQUESTED if animate_world(args) else 0
         report = _animate_scene(args) if args.object is not None else _animate_capture(args)
     except BaseException as error:
         # With --overwrite, the folder may still contain the earlier run, which must not be resumed as this run.

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from egs_warp.commands.camera_flags import shot_of
+from egs_warp.commands.config import NAME, write_config
 from egs_warp.commands.flags import parse_direction
 from egs_warp.commands.scene_flags import print_above_bars, print_note, start_device
 from egs_warp.errors import UserError
+
+if TYPE_CHECKING:
+    from egs_warp.io.run_folder import RunFolder
 
 WORLD_ENDINGS = (".yaml", ".yml")
 """Endings of the names of world files."""
 _FLAGS = (
     *("capture", "out", "overwrite", "device", "camera", "size", "fps", "background", "view_from", "no_shadow"),
-    *("frames", "no_get_up", "style", "preview"),
+    *("frames", "no_get_up", "style", "preview", "config"),
 )
 """Flags that also apply to a world."""
 
@@ -24,23 +30,29 @@ def is_world(capture: str) -> bool:
     return Path(capture).suffix.lower() in WORLD_ENDINGS
 
 
+def check_flags(args: argparse.Namespace, allowed: Sequence[str]) -> None:
+    """Raise ``UserError`` for a flag of the command that is not ``allowed`` for a world."""
+    for action in args.parser._actions:
+        if action.dest in vars(args) and action.dest not in allowed and getattr(args, action.dest) != action.default:
+            flag = action.option_strings[0] if action.option_strings else action.dest
+            raise UserError(f"{flag}: is for a single capture; a world file describes its bodies; leave it out")
+
+
 def animate_world(args: argparse.Namespace) -> bool:
-    """Run ``egs-warp animate`` for a world file; return True if the exit status must report a failure. The caller has
-    checked the output folder."""
-    from egs_warp.io.run_folder import run_folder
+    """Run or resume ``egs-warp animate`` for a world file; return True if the exit status must report a failure. The
+    caller has checked the output folder."""
+    from egs_warp.io.run_folder import ANIMATE_WORLD, run_folder
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.motions.style import read_style
     from egs_warp.pipelines.animate import PREVIEW_SIZE
-    from egs_warp.pipelines.animate_world import COMMAND, write_world
+    from egs_warp.pipelines.animate_world import write_world
+    from egs_warp.pipelines.finished_run import PARTS
     from egs_warp.pipelines.progress import simulation_bar
     from egs_warp.pipelines.simulated_run import check_frames
     from egs_warp.pipelines.world_file import read_world
     from egs_warp.pipelines.world_run import simulate_world
 
-    for action in args.parser._actions:
-        if action.dest in vars(args) and action.dest not in _FLAGS and getattr(args, action.dest) != action.default:
-            flag = action.option_strings[0] if action.option_strings else action.dest
-            raise UserError(f"{flag}: is for a single capture; a world file describes its bodies; leave it out")
+    check_flags(args, _FLAGS)
     shot, background = shot_of(args)
     if background is not None:
         raise UserError("--background: a world has a colour or transparent as its background; give one of these")
@@ -49,7 +61,8 @@ def animate_world(args: argparse.Namespace) -> bool:
     view_from = None if args.view_from is None else parse_direction("view-from", args.view_from)
     ffmpeg_program()
     start_device(args.device)
-    with run_folder(args.out, command=COMMAND, overwrite=args.overwrite) as folder:
+    with run_folder(args.out, command=ANIMATE_WORLD, overwrite=args.overwrite, resume=args.resume) as folder:
+        folder.begin_with(lambda: write_config(folder.file(NAME), args, args.parser))
         scripted = read_world(args.capture, device=args.device, progress=lambda name: print_note(f"preparing {name}"))
         for note in scripted.notes:
             print_note(note)
@@ -61,6 +74,8 @@ def animate_world(args: argparse.Namespace) -> bool:
                 style=style,
                 pushes=scripted.pushes,
                 get_up=not args.no_get_up,
+                parts=lambda name: _folder_of(folder, name) / PARTS,
+                resume=folder.path if folder.resumed else None,
                 progress=show_frames,
             )
         report = write_world(
@@ -78,3 +93,10 @@ def animate_world(args: argparse.Namespace) -> bool:
     print_above_bars(report.summary())
     print_above_bars(f"film: {args.out / str(report.film)} (sheet.png and report.json are beside it)")
     return report.state.is_failure
+
+
+def _folder_of(folder: RunFolder, name: str) -> Path:
+    """Return the folder of a body, which is created."""
+    path = folder.folder(name)
+    path.mkdir(exist_ok=True)
+    return path

@@ -14,6 +14,7 @@ EXAMPLES = (
     "out/jump --to bundle --out jump.egs",
     "out/jump --to skin --out jump.glb",
     "out/jump --to glb --out still.glb --frame 40",
+    "out/duel --to bundle --out duel.egs",
 )
 _WITHOUT_ANTIALIASING = ("splat", "usd")
 """Formats that cannot state that a capture was trained with antialiasing."""
@@ -57,7 +58,7 @@ def _export(args: argparse.Namespace) -> int:
     from egs_warp.launching import use_device
     from egs_warp.pipelines.bundle import export_bundle
     from egs_warp.pipelines.export import export_splats
-    from egs_warp.pipelines.finished_run import FinishedRun
+    from egs_warp.pipelines.finished_world import FinishedWorld, read_finished
     from egs_warp.pipelines.skin import export_skin
     from egs_warp.pipelines.usd import export_usd
 
@@ -69,7 +70,7 @@ def _export(args: argparse.Namespace) -> int:
     if args.mesh is not None and args.to != "skin":
         raise UserError("--mesh: only a skin moves a mesh; leave --mesh out, or give --to skin")
     use_device("cpu")
-    run = FinishedRun.read(args.folder)
+    run = read_finished(args.folder)
     if args.to == "usd":
         export_usd(run, args.out, every=args.every, degree=args.degree)
         paths = [args.out]
@@ -77,11 +78,14 @@ def _export(args: argparse.Namespace) -> int:
         export_bundle(run, args.out, every=args.every, degree=args.degree, licence=args.licence)
         paths = [args.out]
     elif args.to == "skin":
+        if isinstance(run, FinishedWorld):
+            body = args.folder / next(iter(run.bodies))
+            raise UserError(f"--to skin: a skin has one body; export the folder of a body, such as {body}")
         export_skin(run, args.out, every=args.every, mesh=args.mesh)
         paths = [args.out]
     else:
         paths = export_splats(run, args.out, args.to, frame=args.frame, every=args.every, degree=args.degree)
-    if run.creature.splats.antialiased and args.to in _WITHOUT_ANTIALIASING:
+    if run.antialiased and args.to in _WITHOUT_ANTIALIASING:
         print_note(f"the capture was trained with antialiasing, which {args.to} cannot state; set it in the viewer")
     size = sum(path.stat().st_size for path in paths)
     named = str(paths[0]) if len(paths) == 1 else f"{paths[0]} to {paths[-1].name}"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import threading
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from egs_warp.commands.animate_world import is_world
 from egs_warp.commands.flags import Commands, add_planning_flags, guessed_up, named_path, parse_direction, parse_up
+from egs_warp.commands.live_world import live_world, wait_for_end
 from egs_warp.commands.scene_flags import add_object_flags, check_no_scene_flags, print_note, start_device
 
 if TYPE_CHECKING:
@@ -28,13 +28,17 @@ EXAMPLES = (
     "scan.spz --nodes 150 --friction 0.5",
     "out/scene/object.ply --plane out/scene/plane.json --background out/scene/background.ply",
     "room.ply --object picked.json",
+    "duel.yaml",
 )
 
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     live = commands.add_parser("live", help="simulate a creature and control it in the browser")
-    live.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
+    live.add_argument(
+        "capture",
+        help=".ply, compressed .ply, .spz, .splat, .sog, .glb, an unbundled SOG folder, or a world file (.yaml)",
+    )
     live.add_argument(
         "--out", type=named_path, default=Path("out/live"), help="folder for recorded takes: take-1, ... (out/live)"
     )
@@ -66,7 +70,7 @@ def add_parser(commands: Commands) -> None:
     page.add_argument("--background", type=named_path, help="background capture, for example background.ply of a run")
     page.add_argument("--port", type=int, default=0, help="port on 127.0.0.1 (default: any free port)")
     page.add_argument("--no-browser", action="store_true", help="print the address, but do not open the browser")
-    live.set_defaults(run=_live)
+    live.set_defaults(run=_live, parser=live)
 
 
 def _live(args: argparse.Namespace) -> int:
@@ -85,6 +89,8 @@ def _live(args: argparse.Namespace) -> int:
     # Report errors that can be detected before any long work.
     page_text()
     check_port(args.port)
+    if is_world(args.capture):
+        return live_world(args)
     check_out(args.out)
     if args.nodes is not None:
         check_nodes(args.nodes)
@@ -182,14 +188,6 @@ def _read_scene(args: argparse.Namespace) -> _Source:
         up, note = guessed_up(scene.cloud)
         print_note(note)
     return _Source(scene.cloud, up, scene.plane, front if front is not None else scene.front, scene=scene)
-
-
-def wait_for_end(thread: threading.Thread) -> None:
-    """Wait until ``thread`` ends or Ctrl-C."""
-    with suppress(KeyboardInterrupt):
-        while thread.is_alive():
-            # On Windows, a wait without a timeout cannot be interrupted.
-            thread.join(timeout=0.5)
 
 
 def _session(args: argparse.Namespace, source: _Source, *, begin_stage: Callable[[str], object]) -> Session:

@@ -48,12 +48,12 @@ def add_parser(commands: Commands) -> None:
 
 def _render(args: argparse.Namespace) -> int:
     from egs_warp.launching import use_device
-    from egs_warp.pipelines.finished_run import FinishedRun
+    from egs_warp.pipelines.finished_world import read_finished
     from egs_warp.pipelines.render_run import Show, render_run
 
     shot, background = shot_of(args)
     use_device("cpu")
-    run = FinishedRun.read(args.folder, background=Path(background) if background is not None else None)
+    run = read_finished(args.folder, background=Path(background) if background is not None else None)
     count = render_run(
         run,
         args.out,

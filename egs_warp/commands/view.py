@@ -12,6 +12,7 @@ EXAMPLES = (
     "out/jump",
     "out/jump out/hop",
     "out/jump --export page.html",
+    "out/duel",
 )
 
 
@@ -33,13 +34,13 @@ def add_parser(commands: Commands) -> None:
 def _view(args: argparse.Namespace) -> int:
     from egs_warp.launching import use_device
     from egs_warp.web.page import export_page
-    from egs_warp.web.recording import Recording
+    from egs_warp.web.world_recording import read_recording
 
     folders: list[Path] = args.runs
     if len(folders) > 2:
         raise UserError(f"{folders[2]}: only two runs can be shown side by side; leave this one out")
     use_device("cpu")
-    recordings = [Recording.read(folder, background=args.background) for folder in folders]
+    recordings = [read_recording(folder, background=args.background) for folder in folders]
     if args.export is not None:
         size = export_page(args.export, recordings)
         print(f"wrote {args.export} ({size / 1e6:.1f} MB)")

@@ -15,12 +15,13 @@ import numpy as np
 import warp as wp
 
 from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.deformed_shape import DeformedShape, protrusion
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.contact.selection import ACTIVATION_DEPTH, ContactSelector
 from egs_warp.kernels.contact import pair_contact as kernels
-from egs_warp.launching import copy_into, empty, launch_cached, zeros
+from egs_warp.launching import launch_cached, zeros
 from egs_warp.meshing.level_set import LevelSet
-from egs_warp.precision import Mat33, Vec3, Vec4, real
+from egs_warp.precision import Mat33, Vec4, real
 from egs_warp.short_repr import short_repr
 
 BODY_INFLATION = 1.0
@@ -30,8 +31,6 @@ TET_INFLATION = 2.0
 which a selected point is dropped. Parts of a body that are further outside its cage cannot be touched, because elements
 extrapolate badly.
 """
-_STRETCH = 1.01
-"""Upper bound of the stretch of a prop. A prop has a single tetrahedron, which extrapolates exactly."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +202,7 @@ class PairContactDetector:
         launch_cached(
             kernels.pair_gaps_kernel,
             first.gaps.shape,
-            inputs=[*points, *second.shape, first.close_tets, first.positions, second.positions],
+            inputs=[*points, *second.inputs, first.close_tets, first.positions, second.positions],
             outputs=[first.gaps, first.tets_of(second)],
             device=self.device,
         )
@@ -219,7 +218,7 @@ class PairContactDetector:
             shape,
             inputs=[
                 *first.points,
-                *second.shape,
+                *second.inputs,
                 chosen,
                 count,
                 first.tets_of(second),
@@ -248,12 +247,13 @@ def _box_weights(body: PairBody) -> np.ndarray | None:
     return np.linalg.solve(matrix, np.vstack([corners.T, np.ones(8)])).T
 
 
-class _DeformedBody:
-    """Constants of a body on a device, its deformed tetrahedra in a bounding volume hierarchy, and gap buffers."""
+class _DeformedBody(DeformedShape):
+    """The deformed shape of a body, its contact points, and buffers of their gaps."""
 
     def __init__(self, body: PairBody, device: wp.Device) -> None:
-        geometry, mesh, self.device = body.geometry, body.geometry.mesh, device
-        self._margin = TET_INFLATION * body.selector.activation_distance + _protrusion(body)
+        geometry, mesh = body.geometry, body.geometry.mesh
+        margin = TET_INFLATION * body.selector.activation_distance + protrusion(mesh, geometry.weights)
+        super().__init__(mesh, body.rest_positions, body.level_set, margin=margin, device=device)
         self.points = [
             wp.array(mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device),
             wp.array(geometry.weights, dtype=Vec4, device=device),
@@ -261,50 +261,11 @@ class _DeformedBody:
         self.tet_from_point = wp.array(geometry.tet_from_point, dtype=int, device=device)
         self.close_tets = zeros((1, len(mesh.tets)), bool, device)
         """Buffer for the tetrahedra that are close to another body."""
-        self.positions = wp.array(mesh.nodes[None], dtype=Vec3, device=device)
-        self._tets = wp.array(mesh.tets, dtype=wp.vec4i, device=device)
-        self.boxes = [empty(len(mesh.tets), wp.vec3, device) for _ in range(2)]
-        """Lower and upper corners of the inflated boxes of the tetrahedra."""
-        self._compute_boxes()
-        lowers, uppers = self.boxes
-        self.hierarchy = wp.Bvh(lowers, uppers, groups=zeros(len(mesh.tets), int, device))
-        rest = wp.array(body.rest_positions[None], dtype=Vec3, device=device)
-        level_set = body.level_set
-        self.shape = [self._tets, rest, self.hierarchy.id, level_set.lattice, level_set.on_device(device)]
         self.gaps = zeros((1, len(geometry.weights)), real, device)
         self._tets_of: dict[_DeformedBody, wp.array] = {}
-
-    def place(self, positions: np.ndarray) -> None:
-        """Move the nodes to ``positions`` (N, 3)."""
-        copy_into(self.positions, positions[None])
-        self._compute_boxes()
-        self.hierarchy.refit()
 
     def tets_of(self, other: _DeformedBody) -> wp.array:
         """Return the buffer (1, P) for the tetrahedron of ``other`` at each point, initially -1."""
         if other not in self._tets_of:
             self._tets_of[other] = wp.full(self.gaps.shape, -1, dtype=int, device=self.device)
         return self._tets_of[other]
-
-    def _compute_boxes(self) -> None:
-        inputs = [self._tets, self._margin, self.positions]
-        launch_cached(
-            kernels.tet_boxes_kernel,
-            (1, len(self._tets)),
-            inputs=inputs,
-            outputs=self.boxes,
-            device=self.device,
-        )
-
-
-def _protrusion(body: PairBody) -> float:
-    """Return an upper bound, in metres, of the distance between the contact points of a prop and its tetrahedron. It is
-    0 for a cage of several tetrahedra, which encloses the body.
-    """
-    mesh, weights = body.geometry.mesh, body.geometry.weights
-    if len(mesh.tets) > 1:
-        return 0.0
-    inside = np.maximum(weights, 0.0)
-    inside /= inside.sum(axis=1, keepdims=True)
-    offsets = (weights - inside) @ mesh.nodes[mesh.tets[0]]
-    return _STRETCH * float(np.linalg.norm(offsets, axis=1).max())

@@ -25,8 +25,9 @@ from egs_warp.version import __version__
 MANIFEST = "manifest.json"
 CONFIG = "run.yaml"
 """Name of the file with the flags of a run, from which the command resumes the run."""
-ANIMATE = "animate"
-"""Name of the command whose runs can be resumed."""
+ANIMATE, ANIMATE_WORLD = "animate", "animate world"
+"""Names in the manifest of the commands whose runs can be resumed: for a single capture, and for a world."""
+RESUMABLE = (ANIMATE, ANIMATE_WORLD)
 _LOCK = ".egs-run.lock"
 _SCHEMA = 1
 _FILE_ENDINGS = (".mp4", ".mov", ".webm", ".png", ".ply", ".spz", ".splat", ".sog", ".glb", ".json", ".npz", ".yaml")
@@ -171,7 +172,7 @@ def is_interrupted(folder: Path) -> bool:
     manifest = _manifest(folder) if (folder / MANIFEST).is_file() else None
     if not isinstance(manifest, dict) or manifest.get("finished") is not False or _is_unfinished(folder):
         return False
-    return manifest.get("command", ANIMATE) == ANIMATE
+    return manifest.get("command", ANIMATE) in RESUMABLE
 
 
 def has_finished(out: Path | str) -> bool:
@@ -185,7 +186,7 @@ def has_finished(out: Path | str) -> bool:
     if not isinstance(manifest, dict) or not _names_in(manifest):
         raise UserError(f"{path}: not a manifest of a run; start the run again")
     command = manifest.get("command", ANIMATE)
-    if command != ANIMATE:
+    if command not in RESUMABLE:
         raise UserError(f"{out}: egs-warp {command} wrote here, which cannot be resumed; start it again")
     if manifest.get("finished") is True:
         return True

@@ -195,6 +195,7 @@ class Recorder:
             "contact_gap": np.concatenate([report.end_gaps for report in reports]),
             "contact_point": np.concatenate([report.contacts.points for report in reports]),
             "contact_load": np.concatenate([report.forces for report in reports]),
+            **(_frames(reports) if self._folder is not None else {}),
             "kick_step": np.array([step for step, _ in kicks], np.int32),
             "kick_velocity": np.array([kick for _, kick in kicks]).reshape(-1, *reports[0].state.positions.shape),
             "asked_step": np.array([step for step, _ in requests]),
@@ -204,6 +205,18 @@ class Recorder:
         }
         self._steps += len(reports)
         return part
+
+
+def _frames(reports: Sequence[StepReport]) -> dict[str, np.ndarray]:
+    """Return the values that only a continued run reads: the frames (n, 3, 3) of all contacts and their gaps (n,) at
+    the starts of the steps, m; and the drives (d, N, 3), m/s, of the steps ``drive_row`` (d,) of the part."""
+    driven = [(row, report.drive) for row, report in enumerate(reports) if report.drive is not None]
+    return {
+        "contact_axes": np.concatenate([report.contacts.axes for report in reports]),
+        "contact_start_gap": np.concatenate([report.contacts.gaps for report in reports]),
+        "drive_row": np.array([row for row, _ in driven], np.int32),
+        "drive_velocity": np.array([drive for _, drive in driven]).reshape(-1, *reports[0].state.positions.shape),
+    }
 
 
 def _laps(reports: Sequence[StepReport]) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sparse
 
-from egs_warp.contact.detection import ContactDetector
+from egs_warp.contact.contact_set import ContactSet
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.io.arrays import READ_ERRORS
@@ -29,22 +29,21 @@ from egs_warp.locomotion.trajectory import FIRST_PART, part_paths, read_arrays
 class Replay:
     """Reader of the steps in the folder of a ``Recorder``, which returns one requested step after the other."""
 
-    def __init__(self, folder: Path, start: Mapping[str, np.ndarray], detector: ContactDetector) -> None:
+    def __init__(self, folder: Path, start: Mapping[str, np.ndarray]) -> None:
         """Open a recording.
 
         Args:
             folder: folder of the recorder.
             start: first part that the continued run would write.
-            detector: detector that rebuilds the contacts.
 
         Raises:
             UserError: the recorded run started differently, or its first part is damaged.
         """
-        self._folder, self._detector = folder, detector
+        self._folder = folder
         recorded = _read(folder / FIRST_PART)
         if recorded.keys() != start.keys() or any(recorded[key].tobytes() != start[key].tobytes() for key in start):
             raise _other_run(folder)
-        self._steps = self._recorded(start["positions"][0])
+        self._steps = self._recorded(len(start["rest_positions"]))
 
     def step(self, request_digest: int) -> list[StepReport]:
         """Return the reports of the next requested step, one for each step into which it was divided; an empty list at
@@ -61,42 +60,59 @@ class Replay:
             raise _other_run(self._folder)
         return reports
 
-    def _recorded(self, positions: np.ndarray) -> Iterator[tuple[int, list[StepReport]]]:
-        """Yield the digest and the reports of each requested step. The first one starts at ``positions`` (N, 3) m."""
+    def _recorded(self, node_count: int) -> Iterator[tuple[int, list[StepReport]]]:
+        """Yield the digest and the reports of each requested step of a body with ``node_count`` nodes."""
         count = 0
         for path in part_paths(self._folder):
             part = _read(path)
             try:
-                reports = self._reports(part, positions, count)
+                reports = _reports(part, node_count, count)
                 ends = [*(np.flatnonzero(np.diff(part["asked_step"])) + 1), len(reports)]
                 digests = [int(part["asked_digest"][end - 1]) for end in ends]
             except READ_ERRORS as error:
                 raise _damaged(path, error) from error
             for part_digest, first, end in zip(digests, [0, *ends], ends, strict=False):
                 yield part_digest, reports[first:end]
-            count, positions = count + len(reports), reports[-1].state.positions
+            count += len(reports)
 
-    def _reports(self, part: Mapping[str, np.ndarray], positions: np.ndarray, count: int) -> list[StepReport]:
-        """Return the reports of a part that starts at ``positions`` (N, 3), after ``count`` steps."""
-        reports = []
-        stages = part["stages"].tolist()
-        bounds = np.searchsorted(part["contact_step"], np.arange(count, count + len(part["dt"]) + 1))
-        for row, (first, end) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
-            laps = zip(stages, part["milliseconds"][row].tolist(), strict=True)
-            report = StepReport(
-                state=BodyState(part["positions"][row], part["velocities"][row], float(part["time"][row])),
-                dt=float(part["dt"][row]),
-                contacts=self._detector.contact_set(part["contact_point"][first:end], positions),
-                forces=part["contact_load"][first:end],
-                end_gaps=part["contact_gap"][first:end],
-                min_gap=float(part["min_gap"][row]),
-                activations=part["activations"][row],
-                **{name: part[name][row].item() for name in REPORTED},
-                milliseconds={stage: lap for stage, lap in laps if not np.isnan(lap)},
-            )
-            reports.append(report)
-            positions = report.state.positions
-        return reports
+
+def _reports(part: Mapping[str, np.ndarray], node_count: int, count: int) -> list[StepReport]:
+    """Return the reports of a part after ``count`` steps of a body with ``node_count`` nodes."""
+    reports = []
+    nodes = part["contact_nodes"]
+    if (
+        part["positions"].shape[1:] != (node_count, 3)
+        or not 0 <= nodes.min(initial=0) <= nodes.max(initial=0) < node_count
+    ):
+        raise ValueError("its nodes are not those of the body")
+    stages = part["stages"].tolist()
+    drives = dict(zip(part["drive_row"].tolist(), part["drive_velocity"], strict=True))
+    bounds = np.searchsorted(part["contact_step"], np.arange(count, count + len(part["dt"]) + 1))
+    for row, (first, end) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+        laps = zip(stages, part["milliseconds"][row].tolist(), strict=True)
+        contacts = ContactSet(
+            part["contact_point"][first:end],
+            nodes[first:end],
+            part["contact_weights"][first:end],
+            part["contact_axes"][first:end],
+            part["contact_start_gap"][first:end],
+            part["contact_plane"][first:end],
+            node_count,
+        )
+        report = StepReport(
+            state=BodyState(part["positions"][row], part["velocities"][row], float(part["time"][row])),
+            dt=float(part["dt"][row]),
+            contacts=contacts,
+            forces=part["contact_load"][first:end],
+            end_gaps=part["contact_gap"][first:end],
+            min_gap=float(part["min_gap"][row]),
+            activations=part["activations"][row],
+            **{name: part[name][row].item() for name in REPORTED},
+            drive=drives.get(row),
+            milliseconds={stage: lap for stage, lap in laps if not np.isnan(lap)},
+        )
+        reports.append(report)
+    return reports
 
 
 def digest(objectives: Sequence[AnyObjective | np.ndarray]) -> int:

@@ -107,7 +107,7 @@ class BodyRun:
             front=front,
             folder=parts,
         )
-        self._replay = Replay(resume, self._recorder.start, stepper.detector) if resume is not None else None
+        self._replay = Replay(resume, self._recorder.start) if resume is not None else None
         # Digests take time and are only read when a run is continued.
         self._needs_digest = parts is not None or resume is not None
         self._kick: np.ndarray | None = None

@@ -7,18 +7,21 @@ sets, without any code of the solver.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import combinations
-from typing import Self
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 from scipy.interpolate import NdBSpline
 from scipy.optimize import linear_sum_assignment
 
 from egs_warp.contact.detection import ContactGeometry
+from egs_warp.errors import UserError
+from egs_warp.io.arrays import READ_ERRORS
 from egs_warp.locomotion.audit import contact_displacements, momentum_residuals, start_points
-from egs_warp.locomotion.trajectory import CONTACTS, Trajectory
+from egs_warp.locomotion.trajectory import CONTACTS, Trajectory, read_arrays, write_arrays
 from egs_warp.meshing.level_set import LevelSet
 from egs_warp.short_repr import short_repr
 
@@ -62,6 +65,40 @@ class ContactShape:
             level_set.spacing,
             level_set.coefficients,
         )
+
+    @property
+    def level_set(self) -> LevelSet:
+        """The level set."""
+        return LevelSet(self.origin, self.spacing, self.coefficients)
+
+    def save(self, path: Path) -> None:
+        """Write ``contact_shape.npz``; equal shapes give equal bytes."""
+        write_arrays(path, {each.name: np.asarray(getattr(self, each.name)) for each in fields(self)})
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a file that ``save`` wrote. Raises ``UserError`` if it is missing or invalid."""
+        try:
+            arrays = read_arrays(path)
+            values: dict[str, Any] = {each.name: arrays[each.name] for each in fields(cls)}
+            values["spacing"] = float(values["spacing"])
+            shape = cls(**values)
+            shape._check()
+        except FileNotFoundError as error:
+            raise UserError(f"{path}: is missing; run egs-warp animate again to write it") from error
+        except READ_ERRORS as error:
+            raise UserError(f"{path}: cannot be read ({error}); run egs-warp animate again to write it") from error
+        return shape
+
+    def _check(self) -> None:
+        """Raise ``ValueError`` for arrays that are not those of a shape."""
+        count = len(self.point_tets)
+        if self.point_weights.shape != (count, 4) or self.point_tets.shape != (count,):
+            raise ValueError("its contact points and their weights differ in number")
+        if self.rest_positions.shape[1:] != (3,) or self.origin.shape != (3,) or self.coefficients.ndim != 3:
+            raise ValueError("its arrays have wrong shapes")
+        if min(self.coefficients.shape) < 3 or not (np.isfinite(self.coefficients).all() and self.spacing > 0.0):
+            raise ValueError("its level set is invalid")
 
     def points(self, tets: np.ndarray, positions: np.ndarray) -> np.ndarray:
         """Return the contact points (P, 3) m for ``tets`` (T, 4) and nodal ``positions`` (N, 3) m."""

@@ -50,9 +50,14 @@ def roll_out_world(
     for frame in range(frames):
         for _ in range(per_frame):
             objectives = [run.objectives(dt) for run in runs]
-            states = [run.begin_step(each, dt)[0] for run, each in zip(runs, objectives, strict=True)]
-            memories = [run.memory for run in runs]
-            done = _try_advance(partial(stepper.advance, states, memories, objectives, dt))
+            begun = [run.begin_step(each, dt) for run, each in zip(runs, objectives, strict=True)]
+            done = [reports for _, reports in begun]
+            # The parts of the bodies are written one after the other, so that some may miss the last steps of others.
+            if all(done):
+                stepper.observe(done)
+            else:
+                states, memories = [state for state, _ in begun], [run.memory for run in runs]
+                done = _try_advance(partial(stepper.advance, states, memories, objectives, dt))
             stopped = not done
             if stopped:
                 break

@@ -125,7 +125,7 @@ class WorldStepper:
                     reports = self._island(members).advance(*parts, dt)
                 for body, each in zip(members, reports, strict=True):
                     done[body] = each
-        self._count_quiet_steps(done)
+        self.observe(done)
         return done
 
     def _asleep(
@@ -171,7 +171,9 @@ class WorldStepper:
             drive=step.drive(np.zeros_like(state.positions)),
         )
 
-    def _count_quiet_steps(self, done: Sequence[Sequence[StepReport]]) -> None:
+    def observe(self, done: Sequence[Sequence[StepReport]]) -> None:
+        """Count the steps for which each prop has been at rest, after a step of all bodies with the reports ``done``
+        that ``advance`` has returned, possibly in an earlier process."""
         for body, reports in enumerate(done):
             last, soft_body = reports[-1], self.bodies[body].stepper.body
             is_prop = self.bodies[body].stepper.muscles.segment_count == 0

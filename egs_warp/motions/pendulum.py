@@ -40,6 +40,36 @@ class PendulumPlan:
         return self.pressure[k], (1.0 - part) * self.divergent[k] + part * self.divergent[k + 1]
 
 
+@dataclass(frozen=True)
+class FallingPendulum:
+    """Pendulum whose capture point has left the support, so that it falls over an edge: p is constant.
+
+    With the components x = c + c' / w and y = c - c' / w, x - p grows as exp(w t) and y - p decreases as exp(-w t).
+    """
+
+    com: np.ndarray
+    """(2,) m, centre of mass."""
+    capture: np.ndarray
+    """(2,) m, capture point."""
+    edge: np.ndarray
+    """(2,) m, centre of pressure: the point of the support that is nearest to the capture point."""
+    rate: float
+    """w, 1/s."""
+
+    def capture_at(self, time: float) -> np.ndarray:
+        """Return the capture point (2,) in metres after ``time`` s."""
+        return self.edge + np.exp(self.rate * time) * (self.capture - self.edge)
+
+    def com_at(self, time: float) -> np.ndarray:
+        """Return the centre of mass (2,) in metres after ``time`` s."""
+        convergent = self.edge + np.exp(-self.rate * time) * (2.0 * self.com - self.capture - self.edge)
+        return 0.5 * (self.capture_at(time) + convergent)
+
+    def velocity_at(self, time: float) -> np.ndarray:
+        """Return the velocity (2,) in m/s of the centre of mass after ``time`` s."""
+        return self.rate * (self.capture_at(time) - self.com_at(time))
+
+
 def drift(off: np.ndarray, push: np.ndarray, growth: float) -> np.ndarray:
     """Predict the error (2,) of the divergent component.
 

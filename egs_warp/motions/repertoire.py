@@ -26,6 +26,7 @@ from egs_warp.motions.request import MAX_TARGET, MAX_TURN, MotionRequest
 from egs_warp.motions.retake import Retake
 from egs_warp.motions.route import Route, path_route, read_path, straight_route
 from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance
+from egs_warp.motions.skip import Skip
 from egs_warp.motions.stand import StandFor
 from egs_warp.motions.style import Style
 from egs_warp.motions.turn import Turn
@@ -35,6 +36,10 @@ _STEP = 0.1
 """Default length of a step, in body heights."""
 _STEP_FRACTION = "step_fraction"
 """Name of a retake's value: factor on the length and turn of steps."""
+_IN_JUMPS = "in_jumps"
+"""Name of a retake's value: 1 if the body moves in jumps instead of steps."""
+_JUMP_HEIGHT, _TURN_JUMP_HEIGHT = 0.1, 0.2
+"""Heights, in body heights, of the jumps that replace the steps of a walk and of a turn on the spot."""
 _REST_FRAMES = 120
 """Number of frames after the requested time within which a pushed standing body must come to rest."""
 _CLOSING_FRAMES = 300
@@ -106,14 +111,26 @@ def _route_tasks(request: MotionRequest, values: Mapping[str, float], route: Rou
     )
 
 
+def _in_jumps(stance: Stance, goal: np.ndarray) -> BodyMotion:
+    """Return the motion in small jumps to ``goal`` (2,) m, forward and to the left of ``stance``; the body does not
+    turn."""
+    forward = stance.with_forward(goal @ stance.ground.axes[:2])
+    return Skip(forward, float(np.linalg.norm(goal)), _JUMP_HEIGHT * stance.body.height)
+
+
 def _walk_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
-    return _route_tasks(request, request.asked, straight_route(request.asked["distance"] * height), height)
+    distance = request.asked["distance"] * height
+    if request.asked.get(_IN_JUMPS):
+        return _repeat_task(request, request.asked, lambda stance: _in_jumps(stance, np.array([distance, 0.0])))
+    return _route_tasks(request, request.asked, straight_route(distance), height)
 
 
 def _walk_to_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
-    goal = np.array([[request.asked["ahead"], request.asked["left"]]])
+    goal = np.array([request.asked["ahead"], request.asked["left"]])
     values = {**request.asked, "distance": float(np.linalg.norm(goal))}
-    return _route_tasks(request, values, path_route(goal * height), height)
+    if request.asked.get(_IN_JUMPS):
+        return _repeat_task(request, values, lambda stance: _in_jumps(stance, goal * height))
+    return _route_tasks(request, values, path_route(goal[None] * height), height)
 
 
 def _walk_along_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
@@ -126,6 +143,9 @@ def _turn_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     angle = float(np.radians(request.asked["heading_degrees"]))
     values, length = {**request.asked, "distance": 0.0}, _STEP * height
     fraction = values.get(_STEP_FRACTION, 1.0)
+    if values.get(_IN_JUMPS):
+        target = JumpTarget(0.0, _TURN_JUMP_HEIGHT * height)
+        return _repeat_task(request, values, lambda stance: Turn(stance, target, angle))
     return _repeat_task(
         request,
         values,
@@ -228,15 +248,17 @@ _JUMP_RETAKES = (
     Retake("slower and softer", style=_SOFT),
     Retake("slower, softer, lower and shorter", {"distance": 0.6, "height": 0.6, "heading_degrees": 0.6}, style=_SOFT),
 )
-_WALK_RETAKES = (
-    Retake("in steps of half the length", replacements={_STEP_FRACTION: 0.5}),
+_SHORT_STEPS = Retake("in steps of half the length", replacements={_STEP_FRACTION: 0.5})
+_PATH_RETAKES = (
+    _SHORT_STEPS,
     Retake("in steps of a quarter of the length", replacements={_STEP_FRACTION: 0.25}),
 )
+_WALK_RETAKES = (_SHORT_STEPS, Retake("in jumps", replacements={_IN_JUMPS: 1.0}))
 _RUN_RETAKES = tuple(
     replace(
         retake, change=f"at the speed of a walk, {retake.change}", replacements={**retake.replacements, "speed": 1.0}
     )
-    for retake in _WALK_RETAKES
+    for retake in _PATH_RETAKES
 )
 
 
@@ -314,7 +336,7 @@ MOTIONS: Mapping[str, MotionKind] = {
         _walk_along_tasks,
         lambda request: _frames_of_walk(_path_length(_path(request)) + 2.0 * _TURN_PATH, request),
         file="a file of points, as in walk along way.csv",
-        retakes=_WALK_RETAKES,
+        retakes=_PATH_RETAKES,
     ),
     "run": MotionKind(
         (Value("distance", 1.0, -MAX_TARGET, MAX_TARGET, "body heights"),),

@@ -11,9 +11,15 @@ from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.capture_step import capture_motion
+from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump_plan import JumpPhase
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import REST_SPEED, BalanceController, RestDetector, Weights, sole_shares
+from egs_warp.motions.walk import Walk
 
+MAX_CAPTURE_STEPS = 3
+"""Maximum number of capture steps of one stand."""
 _RATE = 4.0
 """Rate in sqrt(g / H) at which the centre of mass returns over the feet."""
 
@@ -119,17 +125,21 @@ class Stand:
 
 
 class StandFor:
-    """Stand for ``seconds`` s, and then until the body is at rest."""
+    """Stand for ``seconds`` s, and then until the body is at rest. A body that loses its balance takes a capture step
+    (``egs_warp.motions.capture_step``)."""
 
     def __init__(self, stance: Stance, seconds: float) -> None:
         self.seconds, self._stand, self._stance = seconds, Stand(stance), stance
         self._started: float | None = None
         self._is_over = False
+        self._step: Walk | Jump | None = None
+        self.step_count = 0
+        """Number of capture steps so far."""
 
     @property
     def is_at_rest(self) -> bool:
         """True if the time has passed and the body is at rest."""
-        return self._is_over and self._stand.is_at_rest
+        return self._is_over and self._step is None and self._stand.is_at_rest
 
     @property
     def expected_time(self) -> float:
@@ -157,12 +167,24 @@ class StandFor:
         return StandOutcome(max(shifts), lean)
 
     def notes(self) -> list[str]:
-        """Return no messages: standing has no target."""
-        return []
+        """Return a message for the user about capture steps."""
+        count = self.step_count
+        return [f"took {count} step{'s' * (count > 1)} to keep its balance"] if count else []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
         the previous step."""
         self._started = state.time if self._started is None else self._started
         self._is_over = state.time - self._started >= self.seconds - 1e-9
-        return self._stand.objectives(state, report, dt)
+        if self._step is not None and self._step.is_at_rest:
+            self._stance, self._step = self._stance.moved_to(state.positions), None
+            self._stand = Stand(self._stance)
+        has_landed = self._step is None or (isinstance(self._step, Jump) and self._step.phase is JumpPhase.LAND)
+        if has_landed and report is not None and self.step_count < MAX_CAPTURE_STEPS:
+            controller = self._stand.controller
+            measurement = controller.measure(state, report)
+            step = capture_motion(self._stance, controller, measurement, state.positions, report)
+            if step is not None:
+                self._step, self.step_count = step, self.step_count + 1
+        moving = self._stand if self._step is None else self._step
+        return list(moving.objectives(state, report, dt))

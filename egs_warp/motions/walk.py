@@ -67,6 +67,7 @@ class Walk:
         step_fraction: float = 1.0,
         crouch: float = 1.0,
         control: WalkControl | None = None,
+        skips_shift: bool = False,
     ) -> None:
         """Plan the walk of the body that stands at ``stance``.
 
@@ -78,6 +79,7 @@ class Walk:
             step_fraction: factor on the maximum length and maximum turn of the steps, at most 1.
             crouch: height of the centre of mass between the first and the last phase, relative to its standing height.
             control: weights and gains.
+            skips_shift: True starts the first swing at the first time step.
 
         Raises:
             UserError: for a body without feet or a flat base, for too little friction to turn the base, and for a route
@@ -89,6 +91,7 @@ class Walk:
             raise UserError("walk: the body has neither feet nor a flat base with a side that it could lift")
         self.body, self.ground = body, stance.ground
         self.control, self._crouch = control or WalkControl(), crouch
+        self._shift_time = 0.0 if skips_shift else _SHIFT_TIME
         normal = stance.ground.axes @ stance.ground.surface_normal
         self._slope = -normal[:2] / normal[2]
         """(2,) slope of the ground: metres of rise per metre forward and to the left."""
@@ -292,7 +295,7 @@ class Walk:
     def _duration(self, phase: WalkPhase) -> float:
         """Return the duration of a phase in seconds."""
         return {
-            WalkPhase.SHIFT: _SHIFT_TIME * self._time_unit,
+            WalkPhase.SHIFT: self._shift_time * self._time_unit,
             WalkPhase.SWING: self.gait.swing_time,
             WalkPhase.STAND: self.gait.double_time,
             WalkPhase.GATHER: (_GATHER_TIME + _REST_TIME) * self._time_unit,

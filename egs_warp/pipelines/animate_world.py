@@ -2,85 +2,26 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from egs_warp.io.run_folder import RunFolder, run_folder
+from egs_warp.io.run_folder import ANIMATE_WORLD, RunFolder, run_folder
 from egs_warp.locomotion.ledger import energy_balance
+from egs_warp.locomotion.world_audit import audit_world
 from egs_warp.motions.stance import REST_SPEED
 from egs_warp.pipelines import render_data
-from egs_warp.pipelines.end_state import State
+from egs_warp.pipelines.finished_run import PARTS
+from egs_warp.pipelines.finished_world import SHAPE
 from egs_warp.pipelines.render_data import RenderData
-from egs_warp.pipelines.report import (
-    GaussianCounts,
-    JsonValue,
-    Report,
-    has_failed_audit,
-    report_of_run,
-    verdict,
-    versions,
-    write_report,
-)
-from egs_warp.pipelines.shot import Shot
+from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run, write_report
+from egs_warp.pipelines.shot import Shot, resized
 from egs_warp.pipelines.simulated_run import BodyResult, SimulatedRun
-from egs_warp.pipelines.world_film import draw_world_film
+from egs_warp.pipelines.world_film import FilmedWorld, draw_world_film, world_camera
+from egs_warp.pipelines.world_report import WorldReport
 from egs_warp.pipelines.world_run import WorldRun
-from egs_warp.short_repr import short_repr
-
-COMMAND = "animate world"
-"""Command in the manifest of a run folder; such a run cannot be resumed."""
-SCHEMA_VERSION = 1
-
-
-@dataclass(frozen=True)
-class WorldReport:
-    """Contents of the ``report.json`` of a world, and the report of each body."""
-
-    __repr__ = short_repr
-
-    bodies: Mapping[str, Report]
-    """Reports by the names of the bodies."""
-    results: Mapping[str, str]
-    """One line for each body: what a creature's motions reached, or how far a prop has moved."""
-    stopped: bool
-    """True if the run ended at a step that could not be solved."""
-    film: str | None = None
-    """Name of the video in the folder of the run; None if there is no film."""
-    notes: tuple[str, ...] = ()
-    """Notes for the user."""
-    asked: Mapping[str, JsonValue] = field(default_factory=dict)
-    """Contents of the world file, ready for JSON."""
-
-    @property
-    def state(self) -> State:
-        """Worst state of all bodies."""
-        states = tuple(report.state for report in self.bodies.values())
-        return State.STOPPED if self.stopped else State.worst(states)
-
-    def to_json(self) -> dict[str, JsonValue]:
-        """Return the whole report, ready for JSON."""
-        return {
-            "schema": SCHEMA_VERSION,
-            "state": self.state.value,
-            "bodies": {
-                name: {"state": report.state.value, "result": self.results[name], "report": f"{name}/report.json"}
-                for name, report in self.bodies.items()
-            },
-            "film": self.film,
-            "notes": list(self.notes),
-            "asked": dict(self.asked),
-            "versions": versions(),
-        }
-
-    def summary(self) -> str:
-        """Return one line for each body, and the verdict of the audit of all bodies."""
-        lines = [f"{name}: {result}" for name, result in self.results.items()]
-        audits = {name: report.audit for name, report in self.bodies.items()}
-        failed = [f"{name}: {verdict(audit)}" for name, audit in audits.items() if has_failed_audit(audit)]
-        return "\n".join([*lines, *(failed or ["audit: passed"])])
 
 
 def write_world(
@@ -117,7 +58,7 @@ def write_world(
     Raises:
         UserError: The folder cannot be written.
     """
-    with run_folder(out, command=COMMAND, overwrite=overwrite) as folder:
+    with run_folder(out, command=ANIMATE_WORLD, overwrite=overwrite) as folder:
         reports: dict[str, Report] = {}
         results: dict[str, str] = {}
         for name, result in run.bodies.items():
@@ -131,17 +72,22 @@ def write_world(
             report = reports[name] = report_of_body(result, notes=unfinished)
             results[name] = report.summary().splitlines()[0] if report.motion else displacement_text(result)
             report.write(place / "report.json")
-        video = None
-        if film:
-            drawn = draw_world_film(run, folder, shot=shot, size=size, view_from=view_from, shadow=shadow, quiet=quiet)
-            video = drawn.file
-            for name, deformer in drawn.deformers.items():
-                result = run.bodies[name]
-                feet = result.place.feet() if isinstance(result, SimulatedRun) else ()
-                render_data_of_body = RenderData.of(deformer.rest, drawn.camera, result.body.muscles, feet)
-                render_data_of_body.save(folder.path / name / render_data.FILE, deformer=deformer)
-        whole = WorldReport(reports, results, run.stopped, video, tuple(notes), asked or {})
+        filmed = FilmedWorld.from_run(run)
+        shot = shot or Shot()
+        camera = resized(world_camera(run, filmed, size, view_from), *(shot.size or (size, size)))
+        for name, body in filmed.bodies.items():
+            result = run.bodies[name]
+            body.shape.save(folder.path / name / SHAPE)
+            feet = result.place.feet() if isinstance(result, SimulatedRun) else ()
+            render_data_of_body = RenderData.of(body.deformer.rest, camera, result.body.muscles, feet)
+            render_data_of_body.save(folder.path / name / render_data.FILE, deformer=body.deformer)
+        shapes = [body.shape for body in filmed.bodies.values()]
+        audit = audit_world([result.simulation.trajectory for result in run.results], shapes)
+        video = draw_world_film(filmed, camera, folder, shot=shot, shadow=shadow, quiet=quiet) if film else None
+        whole = WorldReport(reports, results, audit, run.stopped, video, tuple(notes), asked or {})
         write_report(folder.file("report.json"), whole.to_json())
+        for name in run.bodies:
+            shutil.rmtree(folder.path / name / PARTS, ignore_errors=True)
         if not isinstance(out, RunFolder):
             folder.finish()
     return whole

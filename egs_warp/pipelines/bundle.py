@@ -22,19 +22,21 @@ from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.lighting.surface_normals import surface_normals
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.pipelines.drawn_cage import DrawnCage
 from egs_warp.pipelines.export import chosen_frames
 from egs_warp.pipelines.finished_run import FinishedRun
+from egs_warp.pipelines.finished_world import FinishedWorld
 
 ENDING = ".egs"
 
 
 def export_bundle(
-    run: FinishedRun, path: Path, *, every: int = 1, degree: int | None = None, licence: str = ""
+    run: FinishedRun | FinishedWorld, path: Path, *, every: int = 1, degree: int | None = None, licence: str = ""
 ) -> None:
     """Write ``run`` to a bundle (docs/guide/export.md).
 
     Args:
-        run: The run to export.
+        run: The run to export, of a single capture or of a world.
         path: Name that ends in .egs.
         every: Export each ``every``-th frame at 60 Hz.
         degree: SH degree of the colours; None keeps the degree of the capture.
@@ -46,7 +48,11 @@ def export_bundle(
     check_no_file_of_a_run(path)
     if path.suffix.lower() != ENDING:
         raise UserError(f"{path}: give a name that ends in {ENDING}")
-    write_bundle(path, bundle_of(run, every=every, degree=degree, licence=licence))
+    if isinstance(run, FinishedWorld):
+        bundle = bundle_of_world(run, every=every, degree=degree, licence=licence)
+    else:
+        bundle = bundle_of(run, every=every, degree=degree, licence=licence)
+    write_bundle(path, bundle)
 
 
 def bundle_of(run: FinishedRun, *, every: int = 1, degree: int | None = None, licence: str = "") -> Bundle:
@@ -63,6 +69,32 @@ def bundle_of(run: FinishedRun, *, every: int = 1, degree: int | None = None, li
     if light is not None:
         facts["light"] = light_to_json(normalised(light))
     return Bundle(tuple(bodies), FRAME_RATE / every, len(steps), facts)
+
+
+def bundle_of_world(world: FinishedWorld, *, every: int = 1, degree: int | None = None, licence: str = "") -> Bundle:
+    """Return the bundle of a world, in which each body has its own cage. The arguments are those of
+    ``export_bundle``."""
+    frames = chosen_frames(world, frame=None, every=every)
+    bodies = tuple(
+        _moving_body(
+            run.deformer(),
+            run.trajectory,
+            run.steps[frames],
+            degree,
+            name=name,
+            cage=DrawnCage.of(run.mesh, world.shapes[name]),
+        )
+        for name, run in world.bodies.items()
+    )
+    facts = _facts(world.first.trajectory, world.camera, world.title)
+    frame = world.capture_frame
+    facts |= {
+        "licence": licence,
+        "height": max(t.height for t in world.trajectories),
+        "flat_ground": not world.solids,
+        "capture": {"axes": frame.axes.tolist(), "origin": frame.origin.tolist(), "metres_per_unit": frame.scale},
+    }
+    return Bundle(bodies, FRAME_RATE / every, len(frames), facts)
 
 
 def bundle_of_motion(
@@ -104,15 +136,23 @@ def _facts(t: Trajectory, camera: Camera, title: str) -> dict[str, Any]:
 
 
 def _moving_body(
-    deformer: Deformer, t: Trajectory, steps: np.ndarray, degree: int | None, *, has_normals: bool = False
+    deformer: Deformer,
+    t: Trajectory,
+    steps: np.ndarray,
+    degree: int | None,
+    *,
+    has_normals: bool = False,
+    name: str = "creature",
+    cage: DrawnCage | None = None,
 ) -> BundleBody:
-    cage = BundleCage(
-        rest_nodes=t.rest_positions.astype(np.float32),
-        cage_tets=t.tets,
-        surface=TetMesh(t.rest_positions, t.tets).boundary_faces(),
+    drawn = cage or DrawnCage.of(TetMesh(t.rest_positions, t.tets))
+    bundled = BundleCage(
+        rest_nodes=drawn.nodes.astype(np.float32),
+        cage_tets=drawn.tets,
+        surface=drawn.surface,
         max_stretch=deformer.max_stretch,
-        nodes=t.positions[steps],
+        nodes=drawn.positions(t.positions[steps]),
         **deformer.plan_arrays(),
     )
     normals = surface_normals(deformer.rest) if has_normals else None
-    return BundleBody("creature", with_degree(deformer.rest, degree), cage, normals)
+    return BundleBody(name, with_degree(deformer.rest, degree), bundled, normals)

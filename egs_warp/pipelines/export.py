@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from tqdm import tqdm
@@ -10,17 +12,38 @@ from tqdm import tqdm
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.body_frame import BodyFrame
-from egs_warp.geometry.gaussians import with_degree
+from egs_warp.geometry.gaussians import GaussianCloud, with_degree
 from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.io.sequence import frame_paths
 from egs_warp.io.writing import WRITERS, is_capture_name, writer_of
-from egs_warp.pipelines.finished_run import FinishedRun
 
 Y_UP = BodyFrame(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3), 1.0)
 """Axes of glTF in the frame of a body."""
 
 
-def chosen_frames(run: FinishedRun, *, frame: int | None, every: int) -> np.ndarray:
+class ExportedRun(Protocol):
+    """A finished run of a single capture or of a world whose splats can be exported."""
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames at 60 Hz."""
+        ...
+
+    @property
+    def capture_frame(self) -> BodyFrame:
+        """Transform to the frame and units of exported splats."""
+        ...
+
+    def frame_number(self, frame: int, *, argument: str) -> int:
+        """Return the number, from 0, of a frame."""
+        ...
+
+    def splats_of(self) -> Callable[[int], GaussianCloud]:
+        """Return the function that gives the splats of a frame."""
+        ...
+
+
+def chosen_frames(run: ExportedRun, *, frame: int | None, every: int) -> np.ndarray:
     """Return the indices of the frames at 60 Hz to export: only ``frame``, or each ``every``-th frame.
 
     Raises ``UserError`` if the run does not have ``frame`` or ``every`` is below 1.
@@ -28,12 +51,12 @@ def chosen_frames(run: FinishedRun, *, frame: int | None, every: int) -> np.ndar
     if every < 1:
         raise ArgumentError("every", "give a whole number of at least 1", value=every)
     if frame is None:
-        return np.arange(0, len(run.steps), every)
+        return np.arange(0, run.frame_count, every)
     return np.array([run.frame_number(frame, argument="frame")])
 
 
 def export_splats(
-    run: FinishedRun,
+    run: ExportedRun,
     out: Path | str,
     kind: str,
     *,
@@ -45,7 +68,8 @@ def export_splats(
     """Write ``frame0000.ply`` and so on into ``out``, numbered at 60 Hz, or one ``frame`` to the file ``out``; return
     the paths.
 
-    Files are in the frame and units of the capture, so that they fit its background; ``glb`` files are in metres with
+    Files are in the frame and units of the capture, so that they fit its background. Files of a world contain all
+    bodies, in metres and in the frame of the world; ``glb`` files are in metres with
     y up, as glTF requires.
 
     Args:
@@ -72,9 +96,8 @@ def export_splats(
     else:
         # Several single frames may be in one folder.
         paths = frame_paths(target, frames, write.ending, alone=frame is None)
-    deformer = run.deformer()
+    splats = run.splats_of()
     place = Y_UP if kind == "glb" else run.capture_frame
     for index, path in zip(tqdm(frames, desc="export", unit="frame", disable=quiet), paths, strict=True):
-        cloud = to_body_frame(deformer.deform(run.trajectory.positions[run.steps[index]]).cloud, place)
-        write(path, with_degree(cloud, degree))
+        write(path, with_degree(to_body_frame(splats(index), place), degree))
     return paths

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -120,11 +121,22 @@ class FinishedRun:
 
         Raises ``ArgumentError`` about ``argument`` if the run does not have that frame.
         """
-        count = len(self.steps)
-        if not -count <= frame < count:
-            advice = f"the run has {count} frames; give 0 to {count - 1}, or -1 for the last"
-            raise ArgumentError(argument, advice, value=frame)
-        return frame % count
+        return checked_frame(frame, self.frame_count, argument=argument)
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames at 60 Hz."""
+        return len(self.steps)
+
+    @property
+    def antialiased(self) -> bool:
+        """True if the capture was trained with antialiasing."""
+        return self.creature.splats.antialiased
+
+    def splats_of(self) -> Callable[[int], GaussianCloud]:
+        """Return the function that gives the creature's splats in a frame; each call overwrites the last result."""
+        deformer, t = self.deformer(), self.trajectory
+        return lambda frame: deformer.deform(t.positions[self.steps[frame]]).cloud
 
     @cached_property
     def mesh(self) -> TetMesh:
@@ -168,3 +180,14 @@ class FinishedRun:
         chosen = np.flatnonzero(t.contact_step == step - 1)
         points = np.einsum("cw,cwi->ci", t.contact_weights[chosen], t.positions[step][t.contact_nodes[chosen]])
         return points, t.contact_normal[chosen], t.contact_force[chosen]
+
+
+def checked_frame(frame: int, count: int, *, argument: str) -> int:
+    """Return the number, from 0, of ``frame`` of ``count`` frames; a negative one counts from the end.
+
+    Raises ``ArgumentError`` about ``argument`` if there is no such frame.
+    """
+    if not -count <= frame < count:
+        advice = f"the run has {count} frames; give 0 to {count - 1}, or -1 for the last"
+        raise ArgumentError(argument, advice, value=frame)
+    return frame % count

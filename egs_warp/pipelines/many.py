@@ -1,4 +1,4 @@
-"""Many runs of one creature: in batches on a GPU, in processes of this machine, or on the hosts of a Ray cluster."""
+"""Many runs of one creature or world: in batches on a GPU, in processes of this machine, or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pickle
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, overload
 
 import numpy as np
 
@@ -28,6 +28,8 @@ from egs_warp.pipelines.worker_pool import (
     WorkerPool,
     ended_tasks,
 )
+from egs_warp.pipelines.world import World
+from egs_warp.pipelines.world_job import WorldJob, WorldSummary
 from egs_warp.short_repr import short_repr
 
 
@@ -64,17 +66,64 @@ class JobResult:
         return self.in_memory_trajectory if self.in_memory_trajectory is not None else Trajectory.load(self.file)  # pyright: ignore[reportArgumentType]
 
 
+@dataclass(frozen=True)
+class WorldJobResult:
+    """Result of a job of a world."""
+
+    __repr__ = short_repr
+
+    job: WorldJob
+    attempts: int
+    """Number of attempts: more than one if a worker was lost."""
+    error: str | None
+    """Reason in one line if the job failed; then there are no bodies."""
+    bodies: WorldSummary
+    """Report, frames and trajectory of each body by its name."""
+
+    @property
+    def state(self) -> State | None:
+        """Worst state of all bodies; None if the job failed."""
+        if self.error is not None:
+            return None
+        return State.worst(tuple(body.report.state for body in self.bodies.values()))
+
+
+@overload
 def simulate_many(
     creature: Creature,
     jobs: Sequence[Job],
     *,
+    workers: int | str | None = ...,
+    worlds: int | None = ...,
+    out: Path | str | None = ...,
+    ended: Callable[[int, JobResult], object] = ...,
+    progress: Callable[[int, int], object] = ...,
+) -> tuple[JobResult, ...]: ...
+
+
+@overload
+def simulate_many(
+    creature: World,
+    jobs: Sequence[WorldJob],
+    *,
+    workers: int | str | None = ...,
+    out: Path | str | None = ...,
+    ended: Callable[[int, WorldJobResult], object] = ...,
+    progress: Callable[[int, int], object] = ...,
+) -> tuple[WorldJobResult, ...]: ...
+
+
+def simulate_many(
+    creature: Creature | World,
+    jobs: Sequence[Job] | Sequence[WorldJob],
+    *,
     workers: int | str | None = None,
     worlds: int | None = None,
     out: Path | str | None = None,
-    ended: Callable[[int, JobResult], object] = lambda number, outcome: None,
+    ended: Callable[[int, Any], object] = lambda number, outcome: None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
-) -> tuple[JobResult, ...]:
-    """Run all ``jobs`` of one ``creature``, several at a time.
+) -> tuple[JobResult, ...] | tuple[WorldJobResult, ...]:
+    """Run all ``jobs`` of one ``creature`` or of one world, several at a time.
 
     In a worker process, a job gives the same bits as ``Job.run`` on a machine of the same kind. In a batch, the node
     positions differ from those of ``Job.run`` by less than 1e-9 body heights in the first 30 steps, as long as rounding
@@ -84,14 +133,16 @@ def simulate_many(
     job that fails has an error in its result; the others continue.
 
     Args:
-        creature: The creature of all jobs.
+        creature: The creature of all jobs, or the world of all ``WorldJob``.
         jobs: The jobs.
         workers: Number of processes on this machine; None uses its number of cores; ``"ray"`` or the address of a Ray
             cluster uses the cores of the cluster (docs/guide/many.md).
         worlds: Batch size for the jobs that can run in batches in this process on the creature's device: all jobs,
-            unless they are planned with the strategy ``paper`` or the QP solver ``daqp``. None uses batches of up to
+            unless they are planned with the strategy ``paper`` or the QP solver ``daqp``; not for a world. None uses
+            batches of up to
             1,024 on a GPU if there are at least two such jobs for each core of this machine. 0 uses no batches.
-        out: Folder for trajectories, ``job-0000.npz`` and so on, which are then not held in memory.
+        out: Folder for trajectories, ``job-0000.npz`` and so on, which are then not held in memory; of a world
+            ``job-0000/NAME.npz``, which are held in memory, too.
         ended: Called when a job ends, with its number from 0 and its result.
         progress: Called after each frame with the number of finished frames and the number expected in total.
 
@@ -99,11 +150,20 @@ def simulate_many(
         The results in the order of the jobs.
 
     Raises:
-        UserError: The workers cannot be started.
+        UserError: The workers cannot be started, or the jobs are not those of a creature, or of a world.
     """
     folder = None if out is None else Path(out)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
+    kind = WorldJob if isinstance(creature, World) else Job
+    if not all(isinstance(job, kind) for job in jobs):
+        owner = "a world" if isinstance(creature, World) else "a creature"
+        raise ArgumentError("jobs", f"give only egs.{kind.__name__}, because they are jobs of {owner}")
+    if isinstance(creature, World):
+        if worlds is not None:
+            raise ArgumentError("worlds", "batches are for one creature; leave it out", value=worlds)
+        return _simulate_worlds(creature, cast(Sequence[WorldJob], jobs), workers, folder, ended, progress)
+    jobs = cast(Sequence[Job], jobs)
     outcomes: list[JobResult | None] = [None] * len(jobs)
     counts = _FrameCounter(len(jobs), progress)
     for task in _run_jobs(creature, jobs, workers, worlds, counts):
@@ -117,6 +177,31 @@ def simulate_many(
         outcome = JobResult(
             jobs[task.number], task.attempts, task.error, report, frames, file, trajectory if file is None else None
         )
+        outcomes[task.number] = outcome
+        counts.finish(task.number)
+        ended(task.number, outcome)
+    return tuple(outcome for outcome in outcomes if outcome is not None)
+
+
+def _simulate_worlds(
+    world: World,
+    jobs: Sequence[WorldJob],
+    workers: int | str | None,
+    folder: Path | None,
+    ended: Callable[[int, WorldJobResult], object],
+    progress: Callable[[int, int], object],
+) -> tuple[WorldJobResult, ...]:
+    """Run the jobs of a world; the arguments are those of ``simulate_many``."""
+    outcomes: list[WorldJobResult | None] = [None] * len(jobs)
+    counts = _FrameCounter(len(jobs), progress)
+    for task in map_tasks(_RunWorldJob(world), jobs, workers=workers, progress=counts.update) if jobs else ():
+        bodies: WorldSummary = task.value or {}
+        if folder is not None and bodies:
+            own = folder / f"job-{task.number:04d}"
+            own.mkdir(exist_ok=True)
+            for name, body in bodies.items():
+                body.trajectory.save(own / f"{name}.npz")
+        outcome = WorldJobResult(jobs[task.number], task.attempts, task.error, bodies)
         outcomes[task.number] = outcome
         counts.finish(task.number)
         ended(task.number, outcome)
@@ -198,6 +283,23 @@ class _RunJob:
             assert self._creature is not None, "the creature was sent"
         creature = self._creature
         return job.outcome(creature, job.run(creature, progress=progress))
+
+
+class _RunWorldJob:
+    """Task function that runs a job of a world in a worker."""
+
+    def __init__(self, world: World) -> None:
+        # Computed here, so that the workers receive the level sets instead of computing them.
+        world.stepper()
+        self._pickled_world: bytes = pickle.dumps(world)
+        self._world: World | None = None
+
+    def __call__(self, job: WorldJob, progress: ProgressCallback) -> WorldSummary:
+        if self._world is None:
+            use_device("cpu")
+            self._world = pickle.loads(self._pickled_world)
+            assert self._world is not None, "the world was sent"
+        return job.outcome(job.run(self._world, progress=progress))
 
 
 class _FrameCounter:

@@ -17,8 +17,10 @@ from egs_warp.io.sequence import frame_paths
 from egs_warp.io.video import VideoWriter, write_png
 from egs_warp.pipelines.film import Frame, drawn_frames
 from egs_warp.pipelines.finished_run import FinishedRun
+from egs_warp.pipelines.finished_world import FinishedWorld
 from egs_warp.pipelines.progress import render_bar
-from egs_warp.pipelines.shot import Shot, around, nearest_steps, resized, turntable
+from egs_warp.pipelines.shot import FilmedMotion, Shot, around, nearest_steps, resized, turntable
+from egs_warp.pipelines.world_film import film_steps, world_frames
 
 _MILLIMETRES = 1000.0
 
@@ -35,7 +37,7 @@ class Show(Enum):
 
 
 def render_run(
-    run: FinishedRun,
+    run: FinishedRun | FinishedWorld,
     out: Path,
     shot: Shot,
     *,
@@ -48,7 +50,7 @@ def render_run(
     """Write a video, or a folder of PNGs, of a finished run. Equal arguments give equal pictures.
 
     Args:
-        run: The run.
+        run: The run, of a single capture or of a world.
         out: Video (.mp4, .mov, .webm); a name without an ending is a folder of PNGs.
         shot: Camera, size, frame rate and background.
         show: Quantity to show.
@@ -70,18 +72,29 @@ def render_run(
     if shot.transparent and (show is not Show.COLOUR or (not folder and out.suffix.lower() == ".mp4")):
         advice = "give a .mov, a .webm or a folder" if show is Show.COLOUR else "show colour instead of depth or alpha"
         raise ArgumentError("background", f"H.264, depth and alpha have no transparency; {advice}", value="transparent")
-    t = run.trajectory
-    if hold is None:
-        steps = nearest_steps(t.time, shot.fps)
-        cameras = shot.cameras(run.creature.camera, t, steps, in_scene=run.scene is not None)
+    if isinstance(run, FinishedWorld):
+        motion: FilmedMotion = run.filmed.motion()
+        last = np.arange(run.frame_count)
+        camera, in_scene = run.camera, False
+        steps = film_steps(run.filmed, shot)
     else:
-        steps = np.full(turntable(shot.fps), run.steps[run.frame_number(hold, argument="turntable")])
-        base = resized(run.creature.camera, *(shot.size or (run.creature.camera.width, run.creature.camera.height)))
-        cameras = around(base, t.positions[steps[:1]], count=len(steps))
-    main_light = run.creature.light if light else None
-    scene = run.scene_without_shadow() if light and shadow else run.scene
-    frames = drawn_frames(run.deformer(), t, steps, cameras, shot, scene=scene, shadow=shadow, light=main_light)
-    corners = t.positions[steps] if hold is None else t.positions[steps[:1]]
+        motion, last = run.trajectory, run.steps
+        camera, in_scene = run.creature.camera, run.scene is not None
+        steps = nearest_steps(motion.time, shot.fps)
+    if hold is None:
+        cameras = shot.cameras(camera, motion, steps, in_scene=in_scene)
+    else:
+        steps = np.full(turntable(shot.fps), last[run.frame_number(hold, argument="turntable")])
+        base = resized(camera, *(shot.size or (camera.width, camera.height)))
+        cameras = around(base, motion.positions[steps[:1]], count=len(steps))
+    if isinstance(run, FinishedWorld):
+        frames = world_frames(run.filmed, steps, cameras, shot, shadow=shadow)
+    else:
+        main_light = run.creature.light if light else None
+        scene = run.scene_without_shadow() if light and shadow else run.scene
+        deformer, t = run.deformer(), run.trajectory
+        frames = drawn_frames(deformer, t, steps, cameras, shot, scene=scene, shadow=shadow, light=main_light)
+    corners = motion.positions[steps] if hold is None else motion.positions[steps[:1]]
     near, far = _depths(corners.reshape(-1, 3), cameras) if show is Show.DEPTH else (0.0, 1.0)
     pictures = frame_paths(out, range(len(steps)), ".png") if folder else []
     with contextlib.ExitStack() as stack:

@@ -325,20 +325,21 @@ AUDIT_LIMITS = {
 """Upper limits of the audit; a run that exceeds one does not satisfy the equations (docs/guide/report.md)."""
 
 
+def exceeded_limits(values: Mapping[str, float], limits: Mapping[str, float]) -> list[str]:
+    """Return a text for each of the ``values`` that exceeds its limit; values without a limit are not tested."""
+    exceeded = []
+    for name, value in values.items():
+        limit = limits.get(name)
+        # Not "value > limit", because NaN must exceed the limit, too.
+        if limit is not None and not value <= limit:
+            exceeded.append(f"{name} {value / limit:,.1f} times its limit" if limit else f"{name} {value}, not 0")
+    return exceeded
+
+
 def verdict(result: Audit) -> str:
     """Return one line that says whether the run satisfies its equations, or which values exceed their limits."""
-    exceeded = []
-    for name, value in asdict(result).items():
-        limit = AUDIT_LIMITS[name]
-        # Not "value > limit", because NaN must exceed the limit, too.
-        if not value <= limit:
-            exceeded.append(f"{name} {value / limit:,.1f} times its limit" if limit else f"{name} {value}, not 0")
+    exceeded = exceeded_limits(asdict(result), AUDIT_LIMITS)
     return f"audit: FAILED: {', '.join(exceeded)}" if exceeded else "audit: passed"
-
-
-def has_failed_audit(result: Audit) -> bool:
-    """Return True if a value of ``result`` exceeds its limit."""
-    return any(not value <= AUDIT_LIMITS[name] for name, value in asdict(result).items())
 
 
 def report_of_run(

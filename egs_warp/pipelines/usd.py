@@ -16,10 +16,16 @@ from egs_warp.geometry.gaussians import GaussianCloud, with_degree
 from egs_warp.io.atomic import atomic_write, system_error
 from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.locomotion.world_audit import ContactShape
+from egs_warp.pipelines.drawn_cage import DrawnCage
 from egs_warp.pipelines.export import chosen_frames
 from egs_warp.pipelines.finished_run import FinishedRun
-from egs_warp.pipelines.usd_body import define_body
+from egs_warp.pipelines.finished_world import FinishedWorld
+from egs_warp.pipelines.usd_body import define_body, define_material, define_surroundings
 
+CREATURE, WORLD = "/creature", "/world"
+_SURROUNDINGS = ("physics", "ground")
+"""Prims of a world that are no bodies."""
 SPLATS, CAGE, MUSCLES, FORCES, SCENE = "splats", "cage", "muscles", "forces", "scene"
 _WIDTH = 0.004
 """Width of the curves, m."""
@@ -27,14 +33,22 @@ _WEIGHT_LENGTH = 0.5
 """Length of the line for a force of one body weight, body heights."""
 
 
-def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | None = None, quiet: bool = False) -> None:
+def export_usd(
+    run: FinishedRun | FinishedWorld,
+    path: Path,
+    *,
+    every: int = 1,
+    degree: int | None = None,
+    quiet: bool = False,
+) -> None:
     """Write ``run`` to a USD file in metres, with z up and 60 time codes per second.
 
     The splats are a ParticleField3DGaussianSplat (OpenUSD 26.03 and later), the cage is a mesh, muscles and forces are
-    curves, and the body is a tetrahedral mesh with its material (``usd_body``).
+    curves, and the body is a tetrahedral mesh with its material (``usd_body``). Each body of a world has a prim of its
+    own below ``/world``.
 
     Args:
-        run: The run to export.
+        run: The run to export, of a single capture or of a world.
         path: Name that ends in .usdc or .usda.
         every: Export each ``every``-th frame at 60 Hz.
         degree: SH degree of the colours, which take most of the file; None keeps the degree of the capture.
@@ -43,12 +57,11 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
     Raises:
         UserError: usd-core is not installed or too old, or ``path`` has another ending.
     """
-    Sdf, Usd, UsdGeom, UsdVol, Vt = _modules()
+    _, Usd, UsdGeom, UsdVol, Vt = _modules()
     if path.suffix not in (".usdc", ".usda"):
         raise UserError(f"{path}: give a name that ends in .usdc or .usda")
     check_no_file_of_a_run(path)
     frames = chosen_frames(run, frame=None, every=every)
-    t = run.trajectory
     with atomic_write(path) as temporary, _system_errors():
         stage = Usd.Stage.CreateNew(str(temporary))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -57,52 +70,100 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
         stage.SetFramesPerSecond(FRAME_RATE)
         stage.SetStartTimeCode(float(frames[0]))
         stage.SetEndTimeCode(float(frames[-1]))
-        root = UsdGeom.Xform.Define(stage, "/creature")
-        stage.SetDefaultPrim(root.GetPrim())
-        splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/creature/{SPLATS}")
-        rest = with_degree(run.creature.splats, degree)
-        _write_constant(splats, rest, Vt)
-        cage = UsdGeom.Mesh.Define(stage, f"/creature/{CAGE}")
-        faces = run.mesh.boundary_faces()
-        cage.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-        cage.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
-        cage.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        cage.SetNormalsInterpolation(UsdGeom.Tokens.uniform)
-        cage.CreatePurposeAttr(UsdGeom.Tokens.guide)
-        muscles = _curves(UsdGeom.BasisCurves.Define(stage, f"/creature/{MUSCLES}"), UsdGeom)
-        segments = run.creature.muscle_segments
-        muscles.CreateCurveVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(segments), 2, np.int32)))
-        activation = UsdGeom.PrimvarsAPI(muscles).CreatePrimvar(
-            "activation", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.uniform
-        )
-        forces = _curves(UsdGeom.BasisCurves.Define(stage, f"/creature/{FORCES}"), UsdGeom)
-        weight = float(t.node_mass.sum() * np.linalg.norm(t.gravity))
-        body = define_body(stage, "/creature", t)
-        deformer = run.deformer()
+        if isinstance(run, FinishedWorld):
+            root = WORLD
+            names = _identifiers(list(run.bodies))
+            bodies = [
+                _BodyPrims(stage, f"{WORLD}/{name}", each, shape, degree=degree)
+                for name, each, shape in zip(names, run.bodies.values(), run.shapes.values(), strict=True)
+            ]
+            define_surroundings(stage, WORLD, run.first.trajectory, bodies[0].material)
+        else:
+            root = CREATURE
+            bodies = [_BodyPrims(stage, CREATURE, run, None, degree=degree)]
+            define_surroundings(stage, CREATURE, run.trajectory, bodies[0].material)
+        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, root).GetPrim())
         for index in tqdm(frames, desc="export", unit="frame", disable=quiet):
-            step, code = int(run.steps[index]), float(index)
-            positions = t.positions[step]
-            cloud = with_degree(deformer.deform(positions).cloud, degree)
-            # The first frame is also the default value, for programs and validators that do not specify a time.
-            for at in (Usd.TimeCode.Default(), code) if index == 0 else (code,):
-                _write_sample(splats, cloud, at, Vt)
-                _set_points(cage, positions, at, Vt)
-                _set_points(body, positions, at, Vt)
-                cage.GetNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(_normals(positions[faces])), at)
-            ends = run.creature.muscle_ends @ positions
-            _set_points(muscles, ends[segments].reshape(-1, 3), code, Vt, width=_WIDTH)
-            activation.Set(Vt.FloatArray.FromNumpy(run.activations(step).astype(np.float32)), code)
-            points, _, force = run.contacts(step)
-            tips = points + _WEIGHT_LENGTH * t.height / weight * force
-            forces.GetCurveVertexCountsAttr().Set(Vt.IntArray.FromNumpy(np.full(len(points), 2, np.int32)), code)
-            _set_points(forces, np.stack([points, tips], axis=1).reshape(-1, 3), code, Vt, width=_WIDTH)
-        if run.scene is not None:
-            scene = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/creature/{SCENE}")
+            for body in bodies:
+                body.write_frame(int(index), is_first=index == 0)
+        if isinstance(run, FinishedRun) and run.scene is not None:
+            scene = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"{CREATURE}/{SCENE}")
             still = with_degree(run.scene, degree)
             _write_constant(scene, still, Vt)
             _write_sample(scene, still, Usd.TimeCode.Default(), Vt)
         stage.GetRootLayer().Save()
         del stage
+
+
+class _BodyPrims:
+    """The prims of one body below its path: splats, cage, muscles, forces and, for a soft body, its tetrahedra."""
+
+    def __init__(
+        self, stage: Any, path: str, run: FinishedRun, shape: ContactShape | None, *, degree: int | None
+    ) -> None:
+        """Define the prims. ``shape`` is that of a body of a world, for the drawn surface of a prop."""
+        Sdf, _, UsdGeom, UsdVol, Vt = _modules()
+        self._run, self._degree, self._deformer = run, degree, run.deformer()
+        t = run.trajectory
+        self._outer_cage = DrawnCage.of(run.mesh, shape)
+        UsdGeom.Xform.Define(stage, path)
+        self._splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"{path}/{SPLATS}")
+        _write_constant(self._splats, with_degree(run.creature.splats, degree), Vt)
+        self._cage = UsdGeom.Mesh.Define(stage, f"{path}/{CAGE}")
+        faces = self._outer_cage.surface
+        self._cage.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+        self._cage.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
+        self._cage.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        self._cage.SetNormalsInterpolation(UsdGeom.Tokens.uniform)
+        self._cage.CreatePurposeAttr(UsdGeom.Tokens.guide)
+        self._muscles = _curves(UsdGeom.BasisCurves.Define(stage, f"{path}/{MUSCLES}"), UsdGeom)
+        segments = run.creature.muscle_segments
+        self._muscles.CreateCurveVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(segments), 2, np.int32)))
+        self._activation = UsdGeom.PrimvarsAPI(self._muscles).CreatePrimvar(
+            "activation", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.uniform
+        )
+        self._forces = _curves(UsdGeom.BasisCurves.Define(stage, f"{path}/{FORCES}"), UsdGeom)
+        self._weight = float(t.node_mass.sum() * np.linalg.norm(t.gravity))
+        self.material = define_material(stage, path, t)
+        """Material of the body."""
+        # A prop is stiff; its single tetrahedron is no mesh of its volume.
+        self._soft_body = define_body(stage, path, t, self.material) if len(t.tets) > 1 else None
+
+    def write_frame(self, index: int, *, is_first: bool) -> None:
+        """Write the samples of the frame ``index`` at 60 Hz."""
+        _, Usd, _, _, Vt = _modules()
+        run, t = self._run, self._run.trajectory
+        step, code = int(run.steps[index]), float(index)
+        nodes = t.positions[step]
+        positions = self._outer_cage.positions(nodes)
+        cloud = with_degree(self._deformer.deform(nodes).cloud, self._degree)
+        # The first frame is also the default value, for programs and validators that do not specify a time.
+        for at in (Usd.TimeCode.Default(), code) if is_first else (code,):
+            _write_sample(self._splats, cloud, at, Vt)
+            _set_points(self._cage, positions, at, Vt)
+            if self._soft_body is not None:
+                _set_points(self._soft_body, nodes, at, Vt)
+            self._cage.GetNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(_normals(positions[self._outer_cage.surface])), at)
+        ends = run.creature.muscle_ends @ nodes
+        segments = run.creature.muscle_segments
+        _set_points(self._muscles, ends[segments].reshape(-1, 3), code, Vt, width=_WIDTH)
+        self._activation.Set(Vt.FloatArray.FromNumpy(run.activations(step).astype(np.float32)), code)
+        points, _, force = run.contacts(step)
+        tips = points + _WEIGHT_LENGTH * t.height / self._weight * force
+        self._forces.GetCurveVertexCountsAttr().Set(Vt.IntArray.FromNumpy(np.full(len(points), 2, np.int32)), code)
+        _set_points(self._forces, np.stack([points, tips], axis=1).reshape(-1, 3), code, Vt, width=_WIDTH)
+
+
+def _identifiers(names: list[str]) -> list[str]:
+    """Return a different identifier of USD for each of the ``names``."""
+    found: list[str] = []
+    for name in names:
+        base = import_module("pxr.Tf").MakeValidIdentifier(name)
+        number = 1
+        while (candidate := base if number == 1 else f"{base}_{number}") in (*found, *_SURROUNDINGS):
+            number += 1
+        found.append(candidate)
+    return found
 
 
 @contextmanager

@@ -17,14 +17,14 @@ _GROUND_SIDE = 20.0
 """Side of the drawn part of the ground, body heights; its collider is infinite."""
 
 
-def define_body(stage: Any, path: str, run: Trajectory) -> Any:
-    """Define the soft body, its material, gravity and flat ground below ``path``; return the tetrahedral mesh.
+def define_body(stage: Any, path: str, run: Trajectory, material: Any) -> Any:
+    """Define the soft body below ``path`` with its ``material``; return the tetrahedral mesh.
 
     The default points are the nodes in the first frame, at rest on the ground, from which a simulator starts. The rest
     shape is the unloaded one, which is free of stress.
     """
-    Gf, Sdf, UsdGeom, UsdPhysics, UsdShade, Vt = (
-        import_module(f"pxr.{name}") for name in ("Gf", "Sdf", "UsdGeom", "UsdPhysics", "UsdShade", "Vt")
+    Sdf, UsdGeom, UsdPhysics, UsdShade, Vt = (
+        import_module(f"pxr.{name}") for name in ("Sdf", "UsdGeom", "UsdPhysics", "UsdShade", "Vt")
     )
     types = Sdf.ValueTypeNames
     mesh = UsdGeom.TetMesh.Define(stage, f"{path}/soft_body")
@@ -37,9 +37,16 @@ def define_body(stage: Any, path: str, run: Trajectory) -> Any:
     for schema in ("PhysicsDeformableBodyAPI", "PhysicsVolumeDeformableSimAPI"):
         prim.AddAppliedSchema(schema)
     unloaded = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(run.unloaded_positions, np.float32))
-    mass = float(run.node_mass.sum())
-    prim.CreateAttribute("physics:mass", types.Float).Set(mass)
+    prim.CreateAttribute("physics:mass", types.Float).Set(float(run.node_mass.sum()))
     prim.CreateAttribute("physics:restShapePoints", types.Point3fArray).Set(unloaded)
+    _bind(UsdShade, prim, material)
+    return mesh
+
+
+def define_material(stage: Any, path: str, run: Trajectory) -> Any:
+    """Define the material of a body below ``path`` and return it."""
+    Sdf, UsdPhysics, UsdShade = (import_module(f"pxr.{name}") for name in ("Sdf", "UsdPhysics", "UsdShade"))
+    types, mass = Sdf.ValueTypeNames, float(run.node_mass.sum())
     material = UsdShade.Material.Define(stage, f"{path}/material")
     surface = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
     surface.CreateDensityAttr(mass / float(TetMesh(run.unloaded_positions, run.tets).volumes().sum()))
@@ -51,14 +58,18 @@ def define_body(stage: Any, path: str, run: Trajectory) -> Any:
         material.GetPrim().CreateAttribute(f"physics:{name}", types.Float).Set(float(value))
     # No schema has an attribute for stiffness-proportional damping.
     material.GetPrim().CreateAttribute("egs:dampingTime", types.Float, custom=True).Set(float(run.damping_time))
-    _bind(UsdShade, prim, material)
+    return material
+
+
+def define_surroundings(stage: Any, path: str, run: Trajectory, material: Any) -> None:
+    """Define gravity and flat ground below ``path``; the ground has the friction of ``material``."""
+    Gf, UsdPhysics = (import_module(f"pxr.{name}") for name in ("Gf", "UsdPhysics"))
     scene = UsdPhysics.Scene.Define(stage, f"{path}/physics")
     size = float(np.linalg.norm(run.gravity))
     scene.CreateGravityDirectionAttr(Gf.Vec3f(*(run.gravity / size).tolist()))
     scene.CreateGravityMagnitudeAttr(size)
     if run.ground_coefficients.size == 0:
         _define_ground(stage, f"{path}/ground", run, material)
-    return mesh
 
 
 def _define_ground(stage: Any, path: str, run: Trajectory, material: Any) -> None:

@@ -1,25 +1,31 @@
-"""Film of a simulated world: all bodies are deformed and drawn together, with their shadows on the ground."""
+"""Film of a world: all bodies are deformed and drawn together, with their shadows on the ground and each other."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+import warp as wp
 
+from egs_warp.contact.occlusion import BodyShadows, OccludingBody
+from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.deformer import DeformedGaussians, Deformer
 from egs_warp.deformation.joint_deformer import JointDeformer
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.locomotion.rollout import FRAME_RATE
-from egs_warp.pipelines.captured_body import points_at_rest
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.locomotion.world_audit import ContactShape
 from egs_warp.pipelines.creature import Creature
-from egs_warp.pipelines.film import Filmed, encode_film, path_of, rendered_frames, split_deformer
+from egs_warp.pipelines.film import Filmed, Frame, encode_film, path_of, rendered_frames, split_deformer
 from egs_warp.pipelines.obstacle_cloud import Obstacles, ObstacleShadows, make_obstacles
-from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
-from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, BodyResult
+from egs_warp.pipelines.shot import Shot, framed, nearest_steps
+from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW
 from egs_warp.pipelines.world_run import WorldRun
 from egs_warp.render.shadow import shadow_blur_radius
 from egs_warp.short_repr import short_repr
@@ -40,67 +46,116 @@ _FACING_WEIGHT = 0.6
 
 
 @dataclass(frozen=True)
+class FilmedBody:
+    """A body of a world, ready to be drawn."""
+
+    __repr__ = short_repr
+
+    deformer: Deformer
+    """Deformer of its Gaussians after splitting."""
+    trajectory: Trajectory
+    steps: np.ndarray
+    """(n,) index of the state of each frame at 60 Hz."""
+    shape: ContactShape
+    """Contact points and level set."""
+
+    @property
+    def outline(self) -> np.ndarray:
+        """Points (n, N, 3) m that bound the body in each frame: the nodes of a creature. The nodes of a prop are not
+        near its surface, so its extreme contact points are returned instead."""
+        t, shape = self.trajectory, self.shape
+        positions = t.positions[self.steps]
+        if len(t.tets) > 1:
+            return positions
+        directions = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+        extreme = np.unique(np.argmax(directions @ shape.points(t.tets, t.rest_positions).T, axis=1))
+        return np.einsum("pw,fwi->fpi", shape.point_weights[extreme], positions[:, t.tets[0]])
+
+
+@dataclass(frozen=True)
+class FilmedWorld:
+    """The bodies and obstacles of a simulated or finished world, ready to be drawn."""
+
+    __repr__ = short_repr
+
+    bodies: Mapping[str, FilmedBody]
+    """Bodies by name, in the order of the world."""
+    solids: tuple[Solid, ...]
+    """Obstacles, without the ground."""
+
+    @classmethod
+    def from_run(cls, run: WorldRun) -> FilmedWorld:
+        """Prepare the bodies of a simulated world; their Gaussians are split for their motions."""
+        bodies = {}
+        for name, result in run.bodies.items():
+            body, simulation = result.body, result.simulation
+            shape = ContactShape.of(body.geometry, body.shape.level_set, body.mesh.nodes)
+            bodies[name] = FilmedBody(split_deformer(result), simulation.trajectory, simulation.frames, shape)
+        return cls(bodies, run.world.solids)
+
+    @property
+    def time(self) -> np.ndarray:
+        """(n,) s, time of each frame at 60 Hz."""
+        first = next(iter(self.bodies.values()))
+        return first.trajectory.time[first.steps]
+
+    def motion(self) -> WorldMotion:
+        """Return the motion of all bodies, for cameras."""
+        parts = [body.outline for body in self.bodies.values()]
+        masses = [
+            np.full(part.shape[1], body.trajectory.node_mass.sum() / part.shape[1])
+            for part, body in zip(parts, self.bodies.values(), strict=True)
+        ]
+        frame = BodyFrame(np.eye(3), np.zeros(3), 1.0)
+        return WorldMotion(self.time, np.concatenate(parts, axis=1), np.concatenate(masses), frame)
+
+    def poses(self, frame: int) -> list[np.ndarray]:
+        """Return the node positions (N, 3) m of each body in a frame at 60 Hz."""
+        return [body.trajectory.positions[body.steps[frame]] for body in self.bodies.values()]
+
+    def joint_deformer(self, fixed: GaussianCloud | None = None) -> JointDeformer:
+        """Return the deformer of all bodies into one cloud, followed by the cloud ``fixed``."""
+        return JointDeformer([body.deformer for body in self.bodies.values()], fixed=fixed)
+
+    def shadows(self, device: wp.Device) -> BodyShadows:
+        """Return the contact shadows of the bodies on each other, for the cloud of ``joint_deformer``."""
+        occluding = []
+        for body in self.bodies.values():
+            t, shape = body.trajectory, body.shape
+            mesh = TetMesh(shape.rest_positions, t.tets)
+            occluding.append(OccludingBody(mesh, shape.point_tets, shape.point_weights, shape.level_set, t.height))
+        return BodyShadows(occluding, [body.deformer.rest.count for body in self.bodies.values()], device)
+
+
+@dataclass(frozen=True)
 class WorldMotion:
     """Points of all bodies in each frame of a run, for cameras (``FilmedMotion``)."""
 
     time: np.ndarray
     """(n,) s, time of each frame."""
     positions: np.ndarray
-    """(n, N, 3) m, points of all bodies, body after body: nodes of a creature, extreme contact points of a prop."""
+    """(n, N, 3) m, points of all bodies, body after body (``FilmedBody.outline``)."""
     node_mass: np.ndarray
     """(N,) kg, mass of each point; the points of a body share its mass equally."""
     capture_frame: BodyFrame
     """Frame of the world, without scaling, because cameras from a file are in metres and in the axes of the world."""
 
-    @classmethod
-    def from_run(cls, run: WorldRun) -> WorldMotion:
-        """Return the motion of all bodies of ``run``."""
-        parts = [_outline(result) for result in run.results]
-        counts = [part.shape[1] for part in parts]
-        masses = [np.full(count, each.body.body.mass / count) for count, each in zip(counts, run.results, strict=True)]
-        return cls(
-            run.time, np.concatenate(parts, axis=1), np.concatenate(masses), BodyFrame(np.eye(3), np.zeros(3), 1.0)
-        )
 
-
-@dataclass(frozen=True)
-class WorldFilm:
-    """File, Gaussians and camera of the film of a world."""
-
-    __repr__ = short_repr
-
-    file: str
-    """Name of the video in the folder of the run."""
-    deformers: Mapping[str, Deformer]
-    """Deformer of the Gaussians of each body after splitting, by the name of the body."""
-    camera: Camera
-    """Fixed camera of the film."""
-
-
-def _outline(result: BodyResult) -> np.ndarray:
-    """Return points (n, N, 3) m that bound a body in each frame: the nodes of a creature. The nodes of a prop are not
-    near its surface, so its extreme contact points are returned instead."""
-    body, simulation = result.body, result.simulation
-    positions = simulation.trajectory.positions[simulation.frames]
-    if len(body.mesh.tets) > 1:
-        return positions
-    directions = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
-    extreme = np.unique(np.argmax(directions @ points_at_rest(body.geometry).T, axis=1))
-    return np.einsum("pw,fwi->fpi", body.geometry.weights[extreme], positions[:, body.mesh.tets[0]])
-
-
-def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | np.ndarray | None = None) -> Camera:
+def world_camera(
+    run: WorldRun, filmed: FilmedWorld, size: int, view_from: Sequence[float] | np.ndarray | None = None
+) -> Camera:
     """Return a fixed camera that shows all bodies, and obstacles near them, during the whole run.
 
     By default, the camera is where the bodies hide each other least and the creatures face it.
 
     Args:
         run: The simulated world.
+        filmed: Its bodies.
         size: Width and height of the image, pixels.
         view_from: (3,) Direction to the camera in the axes of the world.
     """
-    points = WorldMotion.from_run(run).positions.reshape(-1, 3)
-    obstacles = _obstacles(run, points)
+    points = filmed.motion().positions.reshape(-1, 3)
+    obstacles = _obstacles(filmed.solids, points, filmed_device(filmed))
     if obstacles is not None:
         near = obstacles.cloud.means.numpy().astype(np.float64)
         low, high = points.min(axis=0), points.max(axis=0)
@@ -122,67 +177,95 @@ def world_camera(run: WorldRun, size: int, view_from: Sequence[float] | np.ndarr
 
 
 def draw_world_film(
-    run: WorldRun,
+    filmed: FilmedWorld,
+    camera: Camera,
     folder: RunFolder,
     *,
     name: str = "world",
-    size: int = 512,
     shot: Shot | None = None,
-    view_from: Sequence[float] | np.ndarray | None = None,
     shadow: bool = True,
     quiet: bool = False,
-) -> WorldFilm:
-    """Render a simulated world and write its video and ``sheet.png``.
+) -> str:
+    """Render all bodies of a world and write the video and ``sheet.png``.
 
     Args:
-        run: The simulated world.
+        filmed: The bodies.
+        camera: Fixed camera, as for ``world_frames``.
         folder: Folder for the files.
         name: Name of the video, without the file ending.
-        size: Width and height of the video, pixels, if ``shot`` has no size.
-        shot: Camera, size, frame rate and background colour.
-        view_from: (3,) Direction to the camera in the axes of the world; None chooses it (``world_camera``).
-        shadow: Draw the shadows of the bodies on the ground and on obstacles.
+        shot: Camera motion, size, frame rate and background colour.
+        shadow: Draw the shadows of the bodies on the ground, on obstacles and on each other.
         quiet: Show no progress bar.
+
+    Returns:
+        The name of the video.
     """
     shot = shot or Shot()
-    motion = WorldMotion.from_run(run)
-    steps = np.arange(len(motion.time)) if shot.fps == FRAME_RATE else nearest_steps(motion.time, shot.fps)
-    camera = resized(world_camera(run, size, view_from), *(shot.size or (size, size)))
-    cameras = shot.cameras(camera, motion, steps)
-    obstacles = _obstacles(run, motion.positions.reshape(-1, 3))
-    deformers = {name: split_deformer(result) for name, result in run.bodies.items()}
-    deformer = JointDeformer(tuple(deformers.values()), fixed=None if obstacles is None else obstacles.cloud)
-    simulations = [result.simulation for result in run.results]
-    poses = ([each.trajectory.positions[each.frames[step]] for each in simulations] for step in steps)
-    filmed = Filmed(
-        np.concatenate([path_of(each.trajectory) for each in simulations]),
-        max(each.trajectory.height for each in simulations),
-    )
+    steps = film_steps(filmed, shot)
+    cameras = shot.cameras(camera, filmed.motion(), steps)
+    frames = world_frames(filmed, steps, cameras, shot, shadow=shadow)
+    path, _ = encode_film(frames, folder, name, cameras[0], shot, filmed.time[steps], quiet=quiet)
+    return path.name
+
+
+def film_steps(filmed: FilmedWorld, shot: Shot) -> np.ndarray:
+    """Return the frames at 60 Hz (m,) that a film at the frame rate of ``shot`` shows."""
+    time = filmed.time
+    return np.arange(len(time)) if shot.fps == FRAME_RATE else nearest_steps(time, shot.fps)
+
+
+def world_frames(
+    filmed: FilmedWorld, frames: np.ndarray, cameras: Sequence[Camera], shot: Shot, *, shadow: bool = True
+) -> Iterator[Frame]:
+    """Render ``frames`` (m,), counted at 60 Hz, each with its camera.
+
+    Args:
+        filmed: The bodies.
+        frames: Frames to render.
+        cameras: Camera of each frame.
+        shot: Background colour and transparency.
+        shadow: Draw the shadows of the bodies on the ground, on obstacles and on each other.
+    """
+    device = filmed_device(filmed)
+    obstacles = _obstacles(filmed.solids, filmed.motion().positions.reshape(-1, 3), device)
+    deformer = filmed.joint_deformer(None if obstacles is None else obstacles.cloud)
+    trajectories = [body.trajectory for body in filmed.bodies.values()]
+    extent = Filmed(np.concatenate([path_of(t) for t in trajectories]), max(t.height for t in trajectories))
     deform = deformer.deform
-    if obstacles is not None and shadow:
-        count = deformer.rest.count - obstacles.cloud.count
-        shadows = ObstacleShadows(obstacles, count, blur_radius=shadow_blur_radius(deformer.rest), height=filmed.height)
-        deform = partial(_deform_with_shadows, deformer, shadows)
-    frames = rendered_frames(deform, deformer.rest, poses, filmed, cameras, shot, shadow=shadow)
-    path, _ = encode_film(frames, folder, name, cameras[0], shot, motion.time[steps], quiet=quiet)
-    return WorldFilm(path.name, deformers, camera)
+    if shadow:
+        on_obstacles = None
+        if obstacles is not None:
+            count, blur = deformer.rest.count - obstacles.cloud.count, shadow_blur_radius(deformer.rest)
+            on_obstacles = ObstacleShadows(obstacles, count, blur_radius=blur, height=extent.height)
+        deform = partial(_deform_with_shadows, deformer, filmed.shadows(deformer.rest.device), on_obstacles)
+    poses = map(filmed.poses, frames)
+    yield from rendered_frames(deform, deformer.rest, poses, extent, cameras, shot, shadow=shadow)
+
+
+def filmed_device(filmed: FilmedWorld) -> str:
+    """Return the device of the Gaussians."""
+    return str(next(iter(filmed.bodies.values())).deformer.rest.device)
 
 
 def _deform_with_shadows(
-    deformer: JointDeformer, shadows: ObstacleShadows, poses: Sequence[np.ndarray]
+    deformer: JointDeformer,
+    on_bodies: BodyShadows,
+    on_obstacles: ObstacleShadows | None,
+    poses: Sequence[np.ndarray],
 ) -> DeformedGaussians:
-    """Deform all bodies and draw their shadows on the obstacles."""
+    """Deform all bodies and draw their shadows on each other and on the obstacles."""
     deformed = deformer.deform(poses)
-    shadows.draw(deformed.cloud)
+    if on_obstacles is not None:
+        on_obstacles.draw(deformed.cloud)
+    on_bodies.draw(deformed.cloud, poses)
     return deformed
 
 
-def _obstacles(run: WorldRun, points: np.ndarray) -> Obstacles | None:
+def _obstacles(solids: Sequence[Solid], points: np.ndarray, device: str) -> Obstacles | None:
     """Return the obstacles near the ``points`` (n, 3) of the bodies; None if there are none to draw."""
     low, high = points.min(axis=0), points.max(axis=0)
     margin = _OBSTACLE_MARGIN * float((high - low).max())
-    device = str(run.results[0].body.cloud.device)
-    return make_obstacles(run.world.solids, low - margin, high + margin, device=device)
+    return make_obstacles(solids, low - margin, high + margin, device=device)
 
 
 def _clearest_view(run: WorldRun) -> np.ndarray:

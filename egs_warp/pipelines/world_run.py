@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from egs_warp.geometry.rigid_path import RigidPath
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.rollout import FRAME_RATE, BodyRun, RolloutResult
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.locomotion.trajectory import FIRST_PART, Trajectory
 from egs_warp.locomotion.world_rollout import roll_out_world, world_steps
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
@@ -25,6 +26,7 @@ from egs_warp.motions.style import Style
 from egs_warp.motions.towards import OtherBody, script_among
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.end_state import EndCause
+from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.prop import Prop
 from egs_warp.pipelines.simulated_run import BodyResult, Performer, SimulatedRun, check_frames
 from egs_warp.pipelines.world import BodyKey, PlacedBody, World
@@ -134,9 +136,16 @@ def simulate_world(
     style: Style | None = None,
     pushes: Mapping[OtherKey, Sequence[Push]] | None = None,
     get_up: bool = True,
+    parts: Callable[[str], Path] | None = None,
+    resume: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
 ) -> WorldRun:
-    """Simulate a world; the arguments are described at ``simulate``."""
+    """Simulate a world; the other arguments are described at ``simulate``.
+
+    Args:
+        parts: Function that returns the folder for the finished steps of the body with a name; None writes none.
+        resume: Folder of the interrupted run of this world to continue; the steps are in the folders of the bodies.
+    """
     check_frames(frames)
     if not world.members:
         raise UserError("world: it has no body; add a creature or a prop")
@@ -159,6 +168,15 @@ def simulate_world(
             if member.name != name
         }
 
+    def parts_of(name: str) -> Callable[[], Path] | None:
+        """Return the function that returns the folder for the steps of a body."""
+        return None if parts is None else partial(parts, name)
+
+    def recorded(name: str) -> Path | None:
+        """Return the folder of the recorded steps of a body; None if it has none."""
+        folder = None if resume is None else resume / name / PARTS
+        return folder if folder is not None and (folder / FIRST_PART).is_file() else None
+
     for member in world.members:
         name, body = member.name, member.body
         if isinstance(body, Creature):
@@ -177,11 +195,28 @@ def simulate_world(
                 raise UserError(f"{name}: {error}") from error
             motion, kicks, front = performer.watch, performer.kicks, body.front.direction
             runs.append(
-                BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame, front=front, kicks=kicks)
+                BodyRun(
+                    *(body.stepper, body.geometry, body.start, motion),
+                    place=body.frame,
+                    front=front,
+                    kicks=kicks,
+                    parts=parts_of(name),
+                    resume=recorded(name),
+                )
             )
         else:
             motion = passive[name] = PassiveMotion(body, member.path)
-            runs.append(BodyRun(body.stepper, body.geometry, body.start, motion, place=body.frame))
+            runs.append(
+                BodyRun(
+                    body.stepper,
+                    body.geometry,
+                    body.start,
+                    motion,
+                    place=body.frame,
+                    parts=parts_of(name),
+                    resume=recorded(name),
+                )
+            )
     settling = round(_PROP_TIME * FRAME_RATE) if passive and frames is None else 0
     limit = max([performer.frame_limit for performer in performers.values()], default=0) + settling
     path_ends = [member.path.end for member in world.members if member.path is not None]

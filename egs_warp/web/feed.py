@@ -23,11 +23,14 @@ from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.simulated_run import FILMED_FROM
 from egs_warp.web.messages import MAX_FRICTION, MAX_SAG, MIN_SAG, STYLE_NAMES, read_message
 from egs_warp.web.packets import Frame
-from egs_warp.web.recording import CURVES, creature_header, curve_facts
+from egs_warp.web.recording import CURVES, cage_arrays, creature_header, curve_facts
 from egs_warp.web.session import Session
 
 _HALF_VIEW_HEIGHT = 1.0
 """Half of the height that the initial camera shows, in body heights."""
+
+STYLES = {name: {key: style[key] for key in STYLE_NAMES} for name, style in {"usual": vars(Style()), **PRESETS}.items()}
+"""Named styles of jumps, for the page."""
 
 
 class LiveFeed:
@@ -71,14 +74,18 @@ class LiveFeed:
             "motion": [],
             "notes": [],
             "limits": {"friction": [0.0, MAX_FRICTION], "sag": [MIN_SAG, MAX_SAG], "style": [MIN_FACTOR, MAX_FACTOR]},
-            "styles": {
-                name: {key: style[key] for key in STYLE_NAMES}
-                for name, style in {"usual": vars(Style()), **PRESETS}.items()
-            },
+            "styles": STYLES,
         }
         planes = np.array([[*plane.normal, plane.offset] for plane in creature.geometry.planes])
         deformer = Deformer(render_data.splats, embed_gaussians(render_data.splats, mesh))
-        return creature_header(facts, render_data, mesh, body.node_mass, planes, deformer, self._scene)
+        return creature_header(
+            facts | {"max_stretch": deformer.max_stretch},
+            render_data,
+            cage=cage_arrays(mesh, deformer),
+            node_mass=body.node_mass,
+            planes=planes,
+            scene=self._scene,
+        )
 
     async def packets(self) -> AsyncGenerator[bytes | str]:
         """Yield frames and events as they come, until the consumer closes the generator."""

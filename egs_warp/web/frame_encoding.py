@@ -1,4 +1,4 @@
-"""Encode a state of a live creature as a frame of the page."""
+"""Encode a state of a live body as a frame of the page."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.captured_body import CapturedBody
 from egs_warp.web.packets import Frame
 
 
-def encode_frame(index: int, state: BodyState, report: StepReport | None, creature: Creature) -> Frame:
+def encode_frame(index: int, state: BodyState, report: StepReport | None, creature: CapturedBody) -> Frame:
     """Build the frame of a state, with all curves of ``recording.CURVES`` except the momentum residual.
 
     Args:

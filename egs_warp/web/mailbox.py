@@ -23,14 +23,15 @@ _MAX_QUEUED_MESSAGES = 1000
 class Mailbox:
     """Queue of messages and queue of news, with one condition that signals every change."""
 
-    def __init__(self) -> None:
+    def __init__(self, changed: threading.Condition | None = None) -> None:
+        """Create empty queues; ``changed`` is a condition that several mailboxes share, or None for an own one."""
         self.watched = False
         """True if a page is subscribed."""
         self.stopping = False
         """True if the session is to end."""
         self._inbox: deque[Message] = deque(maxlen=_MAX_QUEUED_MESSAGES)
         self._outbox: deque[News] = deque()
-        self._changed = threading.Condition()
+        self._changed = threading.Condition() if changed is None else changed
         self._wake: Callable[[], object] = lambda: None
         self._last_state: dict[str, Any] = {}
 
@@ -77,6 +78,16 @@ class Mailbox:
             self._changed.notify_all()
 
     # Called by the session.
+
+    @property
+    def has_requests(self) -> bool:
+        """True if messages are queued."""
+        return bool(self._inbox)
+
+    @property
+    def has_work(self) -> bool:
+        """True if messages are queued, or a page is subscribed that has not received a state."""
+        return bool(self._inbox) or (self.watched and not self._last_state)
 
     def take_requests(self) -> list[Message]:
         """Return and remove the queued messages."""

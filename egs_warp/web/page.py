@@ -6,16 +6,24 @@ import base64
 import gzip
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 from egs_warp.errors import UserError
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import check_no_file_of_a_run
-from egs_warp.web.recording import Recording
 
 PAGE = Path(__file__).with_name("page.html")
 """The page that npm builds."""
 _RUNS_MARKER = "<!-- runs -->"
 """Text of the page that is replaced by the runs."""
+
+
+class EncodedRun(Protocol):
+    """A run that is encoded for the page."""
+
+    def bytes(self) -> bytes:
+        """Return the header and all frames in the format of a file."""
+        ...
 
 
 def page_text() -> str:
@@ -29,7 +37,7 @@ def page_text() -> str:
         ) from error
 
 
-def export_page(path: Path, recordings: Sequence[Recording]) -> int:
+def export_page(path: Path, recordings: Sequence[EncodedRun]) -> int:
     """Write the page with ``recordings`` embedded as one HTML file; return its size in bytes.
 
     The same runs give the same bytes. Raises ``UserError`` if ``path`` does not end in .html or is a file of a run.

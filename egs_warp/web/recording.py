@@ -31,6 +31,22 @@ CURVES = (
 
 
 @dataclass(frozen=True)
+class CageArrays:
+    """Cage of N nodes and T tetrahedra, and the embedding of n' Gaussians."""
+
+    rest: np.ndarray
+    """(N, 3) m, nodes at rest."""
+    tets: np.ndarray
+    """(T, 4) nodes of the tetrahedra."""
+    surface: np.ndarray
+    """(B, 3) nodes of the surface triangles."""
+    mean_tets: np.ndarray
+    """(n',) tetrahedron of each Gaussian, see ``Deformer.plan``."""
+    arms: np.ndarray
+    """(r, 15) arms of Gaussians that extend over several tetrahedra (``arms_of``)."""
+
+
+@dataclass(frozen=True)
 class Recording(FinishedRun):
     """A finished run that is encoded as packets."""
 
@@ -52,13 +68,21 @@ class Recording(FinishedRun):
             "notes": report.get("notes", []),
         }
         plan = {"plan": t.planned_com[self.steps].astype(np.float32)} if len(t.planned_com) else {}
-        constants = (self.creature, self.mesh, t.node_mass, t.planes, self.deformer(), self.scene_without_shadow())
-        return creature_header(facts, *constants, more=plan)
+        deformer = self.deformer()
+        return creature_header(
+            facts | {"max_stretch": deformer.max_stretch},
+            self.creature,
+            cage=cage_arrays(self.mesh, deformer),
+            node_mass=t.node_mass,
+            planes=t.planes,
+            scene=self.scene_without_shadow(),
+            more=plan,
+        )
 
     def frames(self) -> Iterator[Frame]:
         """Yield the frames at 60 Hz."""
         t = self.trajectory
-        curves = _curves(t)
+        curves = body_curves(t)
         for index, step in enumerate(self.steps):
             yield Frame(
                 index,
@@ -82,23 +106,21 @@ def curve_facts(curves: Sequence[tuple[str, str, str]]) -> list[dict[str, str]]:
 def creature_header(
     facts: Mapping[str, Any],
     render_data: RenderData,
-    mesh: TetMesh,
+    *,
+    cage: CageArrays,
     node_mass: np.ndarray,
     planes: np.ndarray,
-    deformer: Deformer,
     scene: GaussianCloud | None,
-    *,
     more: Mapping[str, np.ndarray] | None = None,
 ) -> bytes:
-    """Return the header of a creature.
+    """Return the header of a creature, or of several bodies (``joint_header``).
 
     Args:
         facts: JSON values of the run; the values of the muscles and the camera are added.
         render_data: Gaussians, muscles, feet and camera.
-        mesh: cage at rest.
+        cage: cage and embedding.
         node_mass: (N,) kg, mass of each node.
         planes: (P, 4) rows n, d of the ground planes.
-        deformer: embedding of the Gaussians in the cage.
         scene: background or None; if there is a main light, without the shadow of the object.
         more: further arrays by name.
     """
@@ -115,23 +137,22 @@ def creature_header(
         },
         "degree": {"splats": render_data.splats.sh_degree, "scene": scene.sh_degree if scene else 0},
         "antialiased": render_data.splats.antialiased,
-        "max_stretch": deformer.max_stretch,
     }
     arrays = {
-        "rest": mesh.nodes.astype(np.float32),
-        "tets": mesh.tets.astype(np.int32),
+        "rest": cage.rest.astype(np.float32),
+        "tets": cage.tets.astype(np.int32),
         "node_mass": node_mass.astype(np.float32),
         "planes": planes.astype(np.float32),
-        "surface": mesh.boundary_faces().astype(np.int32),
-        "edges": _edges(mesh.boundary_faces()),
+        "surface": cage.surface.astype(np.int32),
+        "edges": _edges(cage.surface),
         "muscle_end_starts": render_data.muscle_ends.indptr.astype(np.int32),
         "muscle_end_nodes": render_data.muscle_ends.indices.astype(np.int32),
         "muscle_end_weights": render_data.muscle_ends.data.astype(np.float32),
         "muscle_segments": render_data.muscle_segments.astype(np.int32),
         "fibre_from_segment": render_data.fibre_from_segment.astype(np.int32),
         "foot_from_node": render_data.foot_from_node.astype(np.int32),
-        "mean_tets": deformer.plan.mean_tets.numpy(),
-        "arms": _arms(deformer),
+        "mean_tets": cage.mean_tets,
+        "arms": cage.arms,
         **splat_arrays("splats", render_data.splats),
         **(more or {}),
     }
@@ -144,13 +165,18 @@ def creature_header(
     return header(facts, arrays)
 
 
+def cage_arrays(mesh: TetMesh, deformer: Deformer) -> CageArrays:
+    """Return the arrays of one cage and its embedded Gaussians."""
+    return CageArrays(mesh.nodes, mesh.tets, mesh.boundary_faces(), deformer.plan.mean_tets.numpy(), arms_of(deformer))
+
+
 def _edges(faces: np.ndarray) -> np.ndarray:
     """Return the (E, 2) int32 edges of triangles (F, 3)."""
     pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     return np.unique(pairs, axis=0).astype(np.int32)
 
 
-def _arms(deformer: Deformer) -> np.ndarray:
+def arms_of(deformer: Deformer) -> np.ndarray:
     """Return (n', 15) float32: tetrahedra and inside fractions of the six axis ends, and three smoothing lengths.
 
     There is one row for each of the n' Gaussians that extend over several tetrahedra, in the order of the Gaussians.
@@ -181,7 +207,7 @@ def splat_arrays(name: str, cloud: GaussianCloud) -> dict[str, np.ndarray]:
     }
 
 
-def _curves(t: Trajectory) -> np.ndarray:
+def body_curves(t: Trajectory) -> np.ndarray:
     """Return the curves, (F+1, K) in the order of ``CURVES``; docs/guide/report.md defines them."""
     mass = float(t.node_mass.sum())
     gravity = float(np.linalg.norm(t.gravity))

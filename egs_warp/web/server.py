@@ -13,7 +13,7 @@ import secrets
 import socket
 import threading
 from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 from urllib.parse import urlsplit
 
 import uvicorn
@@ -61,6 +61,23 @@ class FrameFeed(Protocol):
         ...
 
 
+class PageFeed(FrameFeed, Protocol):
+    """Feed of one of several pages of a session."""
+
+    def close(self) -> None:
+        """Remove the page from the session."""
+        ...
+
+
+@runtime_checkable
+class SharedFeed(Protocol):
+    """Source of a live session that several pages show at once."""
+
+    def connect(self) -> PageFeed:
+        """Return the feed of a page that connects."""
+        ...
+
+
 class PageServer:
     """Server of the page at a secret local address."""
 
@@ -69,7 +86,7 @@ class PageServer:
         runs: Sequence[Callable[[], bytes]],
         *,
         port: int = 0,
-        feed: FrameFeed | None = None,
+        feed: FrameFeed | SharedFeed | None = None,
         token: str | None = None,
     ) -> None:
         """Bind the port.
@@ -77,7 +94,7 @@ class PageServer:
         Args:
             runs: functions that return the bytes of each run; each is called once.
             port: port to bind; 0 selects a free one.
-            feed: source of a live session, sent to one client at a time, or None.
+            feed: source of a live session, sent to one client at a time, or a shared one, or None.
             token: secret part of the address; None for a random one.
 
         Raises:
@@ -150,16 +167,28 @@ class PageServer:
         feed = self._feed
         assert feed is not None
         await page.accept()
+        if isinstance(feed, SharedFeed):
+            own = feed.connect()
+            try:
+                await _exchange(page, own)
+            finally:
+                own.close()
+            return
         if self._has_client:
             await page.close(1013, "another page shows this session; close it there, and the creature appears here")
             return
         self._has_client = True
         try:
-            with contextlib.suppress(WebSocketDisconnect):
-                await page.send_bytes(await asyncio.to_thread(feed.header))
-                await _first_to_end(_receive_messages(page, feed), _send_packets(page, feed))
+            await _exchange(page, feed)
         finally:
             self._has_client = False
+
+
+async def _exchange(page: WebSocket, feed: FrameFeed) -> None:
+    """Send the header and the packets of ``feed`` and receive messages, until the page or the feed ends."""
+    with contextlib.suppress(WebSocketDisconnect):
+        await page.send_bytes(await asyncio.to_thread(feed.header))
+        await _first_to_end(_receive_messages(page, feed), _send_packets(page, feed))
 
 
 async def _first_to_end(*coroutines: Coroutine[None, None, None]) -> None:

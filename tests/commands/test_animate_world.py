@@ -38,6 +38,8 @@ def test_a_world_file_gives_one_film_and_the_files_of_each_body(
     assert printed[0].startswith("jumper: cut off: jump to target") and printed[1].startswith("target: moved by 0.00 m")
     assert printed[2] == "audit: passed"
     report = json.loads((out / "report.json").read_text())
+    assert report["verdict"] == report["bodies"]["target"]["audit"] == "audit: passed"
+    assert report["audit"]["momentum_residual"] < 1e-12 and report["audit"]["pairs"] == []
     assert report["film"] == "world.mp4" and (out / "world.mp4").stat().st_size > 0
     assert list(report["bodies"]) == ["jumper", "target"]
     for name in ("jumper", "target"):
@@ -46,7 +48,13 @@ def test_a_world_file_gives_one_film_and_the_files_of_each_body(
         assert json.loads((out / name / "report.json").read_text())["state"] in ("done", "cut off")
         assert FinishedRun.read(out / name).mesh.nodes.shape == t.rest_positions.shape
     files = json.loads((out / "manifest.json").read_text())["files"]
-    assert {"world.mp4", "sheet.png", "report.json", "jumper/trajectory.npz", "target/report.json"} <= files.keys()
+    assert {
+        "world.mp4",
+        "sheet.png",
+        "report.json",
+        "jumper/trajectory.npz",
+        "target/contact_shape.npz",
+    } <= files.keys()
 
 
 @pytest.mark.parametrize(

@@ -146,7 +146,7 @@ def test_parts_of_divided_steps_are_joined(tmp_path: Path) -> None:
     for asked, (first, last) in enumerate([(0, 1), (1, 5), (5, 6), (6, 14), (14, 24)]):
         recorder.add(reports[first:last], request_digest=asked)
     recorder.trajectory()
-    replay = Replay(tmp_path, recorder.start, slid.stepper.detector)
+    replay = Replay(tmp_path, recorder.start)
     found = [replay.step(asked) for asked in range(5)]
     assert [len(done) for done in found] == [1, 4, 1, 8, 10] and replay.step(5) == []
     assert same_steps(tuple(report for done in found for report in done), reports)

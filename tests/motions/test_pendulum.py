@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from egs_warp.motions.pendulum import PendulumPlan, drift
+from egs_warp.motions.pendulum import FallingPendulum, PendulumPlan, drift
 
 RATE = 4.4
 
@@ -41,3 +41,14 @@ def test_an_error_of_the_divergent_component_grows() -> None:
     off, push, time = np.array([0.01, -0.02]), np.array([0.03, 0.01]), 0.4
     solved = solve_ivp(lambda _, x: RATE * (x - push), (0.0, time), off, rtol=1e-11, atol=1e-13).y[:, -1]
     assert drift(off, push, float(np.exp(RATE * time))) == pytest.approx(solved, abs=1e-8)
+
+
+def test_a_falling_pendulum_solves_its_equation() -> None:
+    """c'' = w^2 (c - p) by central differences, and x = c + c' / w, with the given start."""
+    fall = FallingPendulum(np.array([0.1, 0.0]), np.array([0.3, 0.1]), np.array([0.2, 0.05]), 3.0)
+    assert np.allclose(fall.com_at(0.0), fall.com) and np.allclose(fall.capture_at(0.0), fall.capture)
+    h, t = 1e-4, 0.4
+    before, now, after = (fall.com_at(t + k * h) for k in (-1, 0, 1))
+    assert np.allclose((after - 2.0 * now + before) / h**2, 9.0 * (now - fall.edge), rtol=1e-5)
+    assert np.allclose((after - before) / (2.0 * h), fall.velocity_at(t), rtol=1e-6)
+    assert np.allclose(fall.capture_at(t), now + fall.velocity_at(t) / 3.0)

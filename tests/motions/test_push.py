@@ -13,7 +13,7 @@ import pytest
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.rollout import RolloutResult, roll_out
-from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.push import DIRECTIONS, Push, PushKicks, kick_of, read_pushes
 from egs_warp.motions.script import motion
@@ -27,6 +27,8 @@ from tests.support.meshes import box_mesh
 from tests.support.stances import DT, FORWARD, block_place
 
 LEFT = np.array(DIRECTIONS["left"])
+HARD_PUSH = "0.05 0.5 ahead"
+"""Push that moves the capture point of the block off its base."""
 
 
 def block() -> CoarseCreature:
@@ -129,10 +131,13 @@ def test_a_pushed_body_moves_with_the_push_and_keeps_its_feet(
     assert np.linalg.norm(pushed.node_mass @ pushed.velocities[-1]) < 0.05 * place.body.mass * place.body.speed_unit
 
 
-def test_a_hard_push_topples_the_body(standing_block: CoarseCreature) -> None:
-    """The push adds several times the energy that lifts the centre of mass over the edge, so that no controller can
-    keep balance."""
-    simulation, fallen = simulate_pushes(standing_block, "0.05 1 left 0.9", frames=90)
+def test_a_hard_push_topples_a_body_that_keeps_its_feet(
+    standing_block: CoarseCreature, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The push adds more energy than lifts the centre of mass over the edge, so that no controller can keep balance
+    without a step."""
+    monkeypatch.setattr("egs_warp.motions.stand.MAX_CAPTURE_STEPS", 0)
+    simulation, fallen = simulate_pushes(standing_block, HARD_PUSH, frames=90)
     assert fallen is not None and fallen.startswith("tilted by")
     assert audit(simulation.trajectory).energy_residual < 1e-6
     t = simulation.trajectory
@@ -141,6 +146,16 @@ def test_a_hard_push_topples_the_body(standing_block: CoarseCreature) -> None:
     middle = np.array([standing_block.place.ground.local(x)[sole, :2].mean(axis=0) for x in t.positions])
     shift = np.linalg.norm(middle - middle[0], axis=1).max() / standing_block.place.body.height
     assert reached.sole_shift == pytest.approx(shift) and reached.lean > 0.2
+
+
+def test_a_hop_catches_a_body_that_falls_over_its_edge(standing_block: CoarseCreature) -> None:
+    """The capture hop moves the feet of the block by more than a quarter of its height."""
+    simulation, fallen = simulate_pushes(standing_block, HARD_PUSH, frames=130)
+    t = simulation.trajectory
+    assert fallen is None and measure(t).tilt_degrees < 2.0
+    assert StandFor(standing_block.place, 0.5).outcome_record(t, 0, len(t.dt)).sole_shift > 0.25
+    assert np.linalg.norm(t.node_mass @ t.velocities[-1]) < 0.05 * t.node_mass.sum() * np.sqrt(9.81 * t.height)
+    assert audit(t).energy_residual < 1e-6
 
 
 def test_a_pushed_run_continues_to_the_same_bits(pushed: Trajectory, tmp_path: Path) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.script import Script, motion
 from egs_warp.motions.sequence import BodyMotion, Stance
+from egs_warp.motions.skip import Skip
+from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
 
 
@@ -48,12 +51,31 @@ def test_the_motion_that_fell_becomes_softer_and_then_lower(place: Stance) -> No
 
 @pytest.mark.parametrize("text", ["walk 0.5", "walk to 0.4,0.2", "turn 90", "run 0.5"])
 def test_walks_take_shorter_steps_to_the_same_place(text: str, place: Stance) -> None:
+    """A run, which has no form in jumps, takes steps of a quarter of the length in its third take."""
     walks = [begun(retaken(motion(text), *[0] * count)[0], place)[0] for count in (0, 1, 2)]
-    usual, half, quarter = (walk for walk in walks if isinstance(walk, Walk))
-    for walk, count in ((half, 2), (quarter, 4)):
+    usual, *shorter = (walk for walk in walks if isinstance(walk, Walk))
+    assert len(shorter) == (2 if text.startswith("run") else 1)
+    for walk, count in zip(shorter, (2, 4), strict=False):
         steps = walk.gait.step_count / usual.gait.step_count
         assert steps == pytest.approx(count, rel=0.3)
         assert walk.planar_poses[-1] == pytest.approx(usual.planar_poses[-1], abs=1e-9)
+
+
+@pytest.mark.parametrize(("text", "goal"), [("walk -0.5", (-0.5, 0.0)), ("walk to 0.4,0.2", (0.4, 0.2))])
+def test_the_third_take_of_a_walk_jumps_to_the_same_place(text: str, goal: tuple[float, float], place: Stance) -> None:
+    """The jumps add up to the distance, and the direction of the first one leads to the goal."""
+    script, change = retaken(motion(text), 0, 0)
+    (skip,) = begun(script, place)
+    assert isinstance(skip, Skip) and change == f"{motion(text).requests[0].name} in jumps"
+    plan, jump = skip.plan_record(), skip.jumps[0]
+    assert plan.jumps * plan.length == pytest.approx(np.hypot(*goal) * place.body.height)
+    ahead = jump.ground.axes[0] @ place.ground.axes[:2].T
+    assert ahead == pytest.approx(np.array(goal) / np.hypot(*goal), abs=1e-9)
+
+
+def test_the_third_take_of_a_turn_is_a_jump(place: Stance) -> None:
+    (turn,) = begun(retaken(motion("turn 90"), 0, 0)[0], place)
+    assert isinstance(turn, Turn)
 
 
 def test_other_motions_have_no_retake() -> None:

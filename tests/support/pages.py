@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from egs_warp.web.recording import Recording
-from egs_warp.web.server import FrameFeed, PageServer
+from egs_warp.web.server import FrameFeed, PageServer, SharedFeed
 
 
 class RecordedFeed:
@@ -38,7 +38,7 @@ class RecordedFeed:
 
 
 @contextmanager
-def served(*runs: Recording, feed: FrameFeed | None = None, **place: Any) -> Iterator[PageServer]:
+def served(*runs: Recording, feed: FrameFeed | SharedFeed | None = None, **place: Any) -> Iterator[PageServer]:
     """Run a server within the block; ``place`` may contain its port and token."""
     server = PageServer([run.bytes for run in runs], feed=feed, **place)
     thread = threading.Thread(target=server.serve)

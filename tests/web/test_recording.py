@@ -20,7 +20,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io import write_ply
 from egs_warp.web.page import PAGE, page_text
-from egs_warp.web.recording import CURVES, Recording, _curves
+from egs_warp.web.recording import CURVES, Recording, body_curves
 from tests.support.packets import read_packets
 from tests.support.slides import slide
 
@@ -91,7 +91,7 @@ def test_curves_are_those_of_the_audit(run_folder: Path):
 
 def test_the_momentum_curve_includes_pushes():
     struck = slide(struck=True).trajectory()
-    assert _curves(struck)[:, [name for name, _, _ in CURVES].index("residual")].max() < 1e-8
+    assert body_curves(struck)[:, [name for name, _, _ in CURVES].index("residual")].max() < 1e-8
 
 
 @needs_page

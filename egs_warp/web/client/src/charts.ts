@@ -8,7 +8,9 @@ const COLOURS = 5;
 
 export class Charts {
   readonly panel = element("section", { class: "curves", "aria-label": "Curves of the audit" });
-  private readonly rows: { canvas: HTMLCanvasElement; value: HTMLElement }[] = [];
+  private readonly rows: { row: HTMLElement; canvas: HTMLCanvasElement; value: HTMLElement }[] = [];
+  /** Body of a world whose curves are shown. */
+  private body = 0;
 
   constructor(
     private readonly source: FrameSource,
@@ -30,8 +32,17 @@ export class Charts {
         seek(((event.clientX - box.left) / box.width) * (source.frames.length - 1));
       });
       this.panel.append(row);
-      this.rows.push({ canvas, value });
+      this.rows.push({ row, canvas, value });
     }
+    this.select(0);
+  }
+
+  /** Show the curves of a body of a world. */
+  select(body: number): void {
+    this.body = body;
+    this.source.header.facts.curves.forEach((curve, k) => {
+      this.rows[k]!.row.hidden = curve.body !== undefined && curve.body !== body;
+    });
   }
 
   draw(framePosition: number): void {
@@ -39,7 +50,10 @@ export class Charts {
     const { frames } = this.source;
     const now = frames[Math.min(Math.round(framePosition), frames.length - 1)];
     const style = getComputedStyle(this.panel);
+    const { curves } = this.source.header.facts;
     this.rows.forEach(({ canvas, value }, k) => {
+      const { body } = curves[k]!;
+      if (body !== undefined && body !== this.body) return;
       const values = frames.map((frame) => frame.curves[k] ?? 0);
       value.textContent = formatted(now?.curves[k] ?? 0);
       const colour = style.getPropertyValue(`--curve-${k % COLOURS}`);

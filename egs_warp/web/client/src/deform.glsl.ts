@@ -75,7 +75,7 @@ float egsLight(sampler2D shade, vec4 region, vec3 p) {
   vec2 uv = 0.5 + 0.5 * (p.xy - region.xy) / region.z;
   float near = 1.0 - smoothstep(0.02, 0.08, abs(p.z) / region.w);
   if (near <= 0.0 || any(greaterThan(abs(uv - 0.5), vec2(0.5)))) return 1.0;
-  return mix(1.0, egsShade(shade, uv, 0.02), near);
+  return mix(1.0, egsShade(shade, uv, 0.02, 1.5 * region.w / region.z), near);
 }
 
 /* Gain of the displayed colour of a splat whose normal n has turned, as in egs_warp/kernels/lighting/relighting.py. */

@@ -39,6 +39,9 @@ export async function fromElement(element: HTMLElement): Promise<FrameSource> {
 export type News =
   | {
       type: "state";
+      /** Name of the body of a world that this page steers, and the motion of each body. */
+      body?: string;
+      bodies?: Record<string, string>;
       doing: string;
       queued: string | null;
       walks: boolean;

@@ -11,7 +11,11 @@ export const BACKGROUND = 0xb9bec6;
 /** Depth below which the floor hides splats, in body heights. Pressed soles extend below the ground by less than
  * this. */
 export const FLOOR_DEPTH = 0.015;
+/** Side of the shadow map for one body, and the largest side for several bodies, texels. */
 const SHADOW_SIDE = 256;
+const MAX_SHADOW_SIDE = 2048;
+/** Half of the side of the shadow map for one body, in body heights. */
+const HALF_SIDE = 1.5;
 /** Radius of the contact shadow, as a fraction of the side of the shadow map. */
 const SOFTNESS = 0.014;
 /** Minimum sine of the elevation of the main light, as in egs_warp/render/shadow.py. */
@@ -53,16 +57,21 @@ export class Ground {
   private readonly caster: THREE.Mesh;
   private readonly casters = new THREE.Scene();
   private readonly points: THREE.BufferAttribute;
+  /** Side of the shadow map for one body, divided by the side of this one. */
+  private readonly spread: number;
   /** Displacement of the main light's shadow, per unit of height over the ground. */
   private readonly slope = new THREE.Vector2();
 
-  constructor(surface: Int32Array, nodeCount: number, height: number, light?: MainLight) {
-    this.target = new THREE.WebGLRenderTarget(SHADOW_SIDE, SHADOW_SIDE, {
+  /** `extent` is half of the horizontal extent of several bodies, m; the shadow map covers it. */
+  constructor(surface: Int32Array, nodeCount: number, height: number, light?: MainLight, extent = 0) {
+    const half = HALF_SIDE * height + extent;
+    this.spread = (HALF_SIDE * height) / half;
+    const side = Math.min(SHADOW_SIDE * 2 ** Math.ceil(-Math.log2(this.spread)), MAX_SHADOW_SIDE);
+    this.target = new THREE.WebGLRenderTarget(side, side, {
       depthBuffer: false,
       generateMipmaps: true,
       minFilter: THREE.LinearMipmapLinearFilter,
     });
-    const half = 1.5 * height;
     const shade = light?.shade ?? 0;
     if (light !== undefined && shade > 0) {
       const [x, y, z] = light.direction;
@@ -118,6 +127,7 @@ export class Ground {
         shade: { value: this.target.texture },
         shadeCentre: { value: new THREE.Vector2() },
         shadeHalf: { value: half },
+        spread: { value: this.spread },
         cell: { value: 0.25 * height },
         box: { value: new THREE.Vector4() },
         viewToWorld: { value: new THREE.Matrix3() },
@@ -133,7 +143,7 @@ export class Ground {
         }`,
       fragmentShader: `
         varying vec3 ray; uniform sampler2D shade; uniform vec2 shadeCentre; uniform vec3 eye, forward;
-        uniform float shadeHalf, cell; uniform vec4 box;
+        uniform float shadeHalf, cell, spread; uniform vec4 box;
         ${SHADOW_GLSL}
         /* 1 on the lines of a grid; lines that come closer than some pixels are blended out. */
         float line(vec2 p, vec2 pixel, float cell) {
@@ -151,7 +161,8 @@ export class Ground {
             float strength = max(0.4 * line(p, pixel, cell), line(p, pixel, 4.0 * cell));
             vec3 ground = mix(${LOOK.floor}, ${LOOK.line}, strength);
             vec2 uv = 0.5 + 0.5 * (p - shadeCentre) / shadeHalf;
-            if (all(greaterThan(uv, box.xy)) && all(lessThan(uv, box.zw))) ground *= egsShade(shade, uv, ${SOFTNESS});
+            bool inside = all(greaterThan(uv, box.xy)) && all(lessThan(uv, box.zw));
+            if (inside) ground *= egsShade(shade, uv, ${SOFTNESS}, spread);
             float middle = eye.z / max(-forward.z, ${LOOK.minSlope}), depth = dot(vec3(p, 0.0) - eye, forward);
             float haze = smoothstep(${LOOK.clear} * middle, ${LOOK.hazy} * middle, depth);
             colour = mix(ground, ${LOOK.horizon}, haze);
@@ -179,14 +190,14 @@ export class Ground {
     this.shadowMesh = new THREE.Mesh(
       new THREE.PlaneGeometry(2 * half, 2 * half),
       new THREE.ShaderMaterial({
-        uniforms: { shade: material.uniforms.shade!, box: material.uniforms.box! },
+        uniforms: { shade: material.uniforms.shade!, box: material.uniforms.box!, spread: { value: this.spread } },
         vertexShader: `varying vec2 at;
           void main() { at = uv; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
-        fragmentShader: `varying vec2 at; uniform sampler2D shade; uniform vec4 box;
+        fragmentShader: `varying vec2 at; uniform sampler2D shade; uniform vec4 box; uniform float spread;
           ${SHADOW_GLSL}
           void main() {
             if (any(lessThan(at, box.xy)) || any(greaterThan(at, box.zw))) discard;
-            gl_FragColor = vec4(0.0, 0.0, 0.0, 1.0 - egsShade(shade, at, ${SOFTNESS}));
+            gl_FragColor = vec4(0.0, 0.0, 0.0, 1.0 - egsShade(shade, at, ${SOFTNESS}, spread));
           }`,
         transparent: true,
         depthTest: false,
@@ -197,7 +208,7 @@ export class Ground {
     this.shadowMesh.visible = false;
   }
 
-  /** Render the shadow map of the cage at node `positions`, centred at `centreOfMass`. */
+  /** Render the shadow map of the cages at node `positions`, centred at `centreOfMass`. */
   cast(renderer: THREE.WebGLRenderer, positions: Float32Array, centreOfMass: THREE.Vector3): void {
     (this.points.array as Float32Array).set(positions);
     this.points.needsUpdate = true;
@@ -242,7 +253,7 @@ export class Ground {
     const half = this.shadow.region.z;
     const at = (x: number, middle: number): number => 0.5 + (0.5 * (x - middle)) / half;
     // The blur radius and a texel of the coarser level, clipped to the shadow map.
-    const edge = WIDE_RADIUS + 10 / SHADOW_SIDE;
+    const edge = this.spread * (WIDE_RADIUS + 10 / SHADOW_SIDE);
     (this.mesh.material.uniforms.box!.value as THREE.Vector4).set(
       Math.max(at(left, centre.x) - edge, 0),
       Math.max(at(near, centre.y) - edge, 0),

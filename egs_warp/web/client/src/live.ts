@@ -44,6 +44,8 @@ const HELP: [string[], string][] = [
 
 export class Live {
   readonly clock: LiveClock;
+  /** Called with the selected body of a world and the motion of each body. */
+  onSelect: (index: number | undefined, states: Record<string, string>) => void = () => {};
   /** Latest state of the session. */
   state: State | undefined;
   /** All messages to the user, the newest last. */
@@ -83,7 +85,7 @@ export class Live {
     this.pointer = new Pointer(
       viewer,
       source,
-      (node) => this.pushTool.push(node),
+      (node) => this.click(node),
       (x, y) => this.go(x, y),
     );
     viewer.headset.onFloor = ({ x, y }) => this.go(x, y);
@@ -222,6 +224,21 @@ export class Live {
     pressed?.animate([{ background: "rgb(127 209 184 / 55%)" }, { background: "transparent" }], FLASH_TIME);
   }
 
+  /** Steer another creature of a world. */
+  select(index: number): void {
+    const part = this.viewer.parts?.[index];
+    if (part?.creature) this.source.send({ type: "select", body: part.name });
+  }
+
+  /** Push the creature that is steered; a click on another creature of a world selects it. */
+  private click(node: number): void {
+    const { parts } = this.viewer;
+    const index = this.viewer.bodyOf(node);
+    const isOther = parts?.[index]?.creature === true && parts[index].name !== this.state?.body;
+    if (isOther) this.select(index);
+    else if (parts?.[index]?.creature !== false) this.pushTool.push(node);
+  }
+
   private go(x: number, y: number): void {
     this.source.send({ type: "go", x, y });
     this.gizmos.showGoal([x, y]);
@@ -276,6 +293,9 @@ export class Live {
     this.sliders.sag.show(-Math.log(state.sag));
     this.stylePanel.show(state.style);
     this.gizmos.showGoal(state.goal);
+    const selected = this.viewer.parts?.findIndex(({ name }) => name === state.body) ?? -1;
+    this.onSelect(selected < 0 ? undefined : selected, state.bodies ?? {});
+    if (before?.body !== state.body) this.isFacingShown = false;
     this.updateNextLabel();
     this.viewer.invalidate();
   }

@@ -1,11 +1,13 @@
-// Colours of splats that depend on the picked object to which they belong.
+// Colours of splats that depend on the picked object, or on the selected body, to which they belong.
 
 export const MARK_GLSL = /* glsl */ `
 /* Colour c of a splat: lit if it belongs to the object number lit, darker for another object, dim for none. Nothing
-   changes while lit is negative. */
+   changes while lit is negative. From 256 on, lit - 256 is the number of a selected body; other splats keep their
+   colours. */
 vec3 egsMarked(vec3 c, sampler2D marks, int index, int lit) {
   if (lit < 0) return c;
   int label = int(egsTexel(marks, index).r * 255.0 + 0.5);
+  if (lit >= 256) return label == lit - 256 ? min(1.08 * c + 0.1 * vec3(0.5, 0.82, 0.72), vec3(1.0)) : c;
   float grey = dot(c, vec3(0.3, 0.6, 0.1));
   if (label == 0) return 0.42 * mix(vec3(grey), c, 0.45);
   if (label != lit) return 0.55 * c + 0.16 * vec3(1.0, 0.76, 0.29);

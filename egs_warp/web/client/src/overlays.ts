@@ -32,7 +32,7 @@ export class Overlays {
   private readonly visible = new Set<Layer>();
   private readonly ends: Float32Array;
   /** Centre of mass of each frame. */
-  private readonly path = new WeakMap<Frame, THREE.Vector3>();
+  private path = new WeakMap<Frame, THREE.Vector3>();
 
   constructor(
     private readonly header: Header,
@@ -77,6 +77,11 @@ export class Overlays {
     if (this.visible.has("feet")) this.feet.update(frame, positions);
     if (this.visible.has("contacts")) this.drawContacts(frame);
     if (this.visible.has("path")) this.drawPath(frame, frames);
+  }
+
+  /** Compute the path of the centre of mass again, because it belongs to another body. */
+  resetPath(): void {
+    this.path = new WeakMap();
   }
 
   private apply(): void {

@@ -2,8 +2,24 @@
 
 import type { Embedding, SplatData } from "./splats";
 
+/** A body of a world: its parts of the joint nodes and splats, and its row of the report. */
+export interface BodyPart {
+  name: string;
+  /** True for a creature, false for a prop. */
+  creature: boolean;
+  /** First node and number of nodes. */
+  nodes: [number, number];
+  /** First splat and number of splats. */
+  splats: [number, number];
+  state?: string;
+  result?: string;
+  audit?: string;
+}
+
 export interface Curve {
   name: string;
+  /** Index of the body of a world; undefined for a run with one body. */
+  body?: number;
   title: string;
   unit: string;
 }
@@ -15,6 +31,8 @@ export interface Facts {
   height: number;
   weight: number;
   friction: number;
+  /** Bodies of a world; undefined for a run with one body. */
+  bodies?: BodyPart[];
   /** Horizontal unit vector of the front of the body at rest. */
   front: [number, number];
   /** True if the ground is the plane z = 0. */

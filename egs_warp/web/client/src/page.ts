@@ -1,5 +1,6 @@
 // The page: layout of viewers and controls, and the animation loop.
 
+import { BodyPanel } from "./body_panel";
 import { Charts } from "./charts";
 import { button, element, save, type Icon } from "./dom";
 import { createKeySheet } from "./key_sheet";
@@ -13,6 +14,8 @@ import { Preparation } from "./preparation";
 import { LiveSource, type FrameSource } from "./frame_source";
 import { Viewer, type Preset, type LayerToggle } from "./viewer";
 
+/** Maximum movement of the pointer during a click, pixels. */
+const MAX_CLICK_DISTANCE = 4;
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
 /** Maximum time per image before the resolution is reduced, s: for a recorded run and for a live session. */
 const MAX_FRAME_TIME = 1 / 15;
@@ -56,6 +59,10 @@ export class Page {
   readonly live: Live | undefined;
   /** Controls of the page on which objects are picked; undefined on other pages. */
   readonly pick: Pick | undefined;
+  /** Rows of the bodies of a world; undefined for a run with one body. */
+  private bodyPanel: BodyPanel | undefined;
+  /** Selected body of a world. */
+  selected: number | undefined;
   private readonly charts: Charts;
   private readonly legend: Legend;
   private readonly keySheet = createKeySheet(HELP);
@@ -107,6 +114,14 @@ export class Page {
     const notes = element("div", { class: "notes" }, this.legend.element, this.charts.panel);
     root.append(this.toolbar(), notes, ...controls);
     this.charts.panel.hidden = true;
+    const { bodies } = first.header.facts;
+    if (bodies !== undefined && sources.length === 1) {
+      const select = (index: number): void => (this.live === undefined ? this.select(index) : this.live.select(index));
+      this.bodyPanel = new BodyPanel(bodies, select);
+      root.append(this.bodyPanel.element);
+      if (this.live === undefined) this.selectByClick();
+      else this.live.onSelect = (index, states) => this.showSelected(index, states);
+    }
     new ResizeObserver(() => {
       for (const viewer of this.viewers) viewer.resize();
       this.charts.draw(this.framePosition);
@@ -133,6 +148,35 @@ export class Page {
     for (const viewer of this.viewers) viewer.setLayerVisible(name, on);
     this.legend.show(name, on);
     this.update();
+  }
+
+  /** Select a body of a world, or none if it is selected already. */
+  select(index: number): void {
+    this.showSelected(this.selected === index ? undefined : index);
+  }
+
+  private showSelected(index: number | undefined, states?: Record<string, string>): void {
+    if (states !== undefined) this.bodyPanel?.showStates(states);
+    if (index === this.selected) return;
+    this.selected = index;
+    this.first.select(index);
+    this.bodyPanel?.show(index);
+    this.charts.select(index ?? 0);
+    this.update();
+  }
+
+  /** Select the body on which the user clicks. */
+  private selectByClick(): void {
+    const { canvas } = this.first;
+    let start: [number, number] | undefined;
+    canvas.addEventListener("pointerdown", ({ clientX, clientY }) => {
+      start = [clientX, clientY];
+    });
+    canvas.addEventListener("pointerup", ({ clientX, clientY }) => {
+      if (start === undefined || Math.hypot(clientX - start[0], clientY - start[1]) > MAX_CLICK_DISTANCE) return;
+      const hit = this.first.pick(clientX, clientY);
+      if (hit !== undefined) this.select(this.first.bodyOf(hit.node));
+    });
   }
 
   /** The viewer whose content headsets and videos show. */

@@ -1,6 +1,6 @@
 // Fraction of light that reaches the ground under the creature, for the floor and for a captured ground.
 
-/** Radius of the wide part of the shadow, as a fraction of the side of the shadow map. */
+/** Radius of the wide part of the shadow, as a fraction of the side of the shadow map for one body. */
 export const WIDE_RADIUS = 0.08;
 
 const GOLDEN_ANGLE = 2.399963;
@@ -15,7 +15,7 @@ function discOffset(k: number, count: number): string {
 }
 
 function nearSample(k: number): string {
-  return `near += textureLod(shade, uv + softness * ${discOffset(k, NEAR_SAMPLES)}, 1.5).gb;`;
+  return `near += textureLod(shade, uv + spread * softness * ${discOffset(k, NEAR_SAMPLES)}, 1.5).gb;`;
 }
 
 const WIDE_WEIGHTS = Array.from({ length: WIDE_SAMPLES }, (_, k) => Math.exp((-2 * (k + 0.5)) / WIDE_SAMPLES));
@@ -23,15 +23,15 @@ const WIDE_TOTAL = WIDE_WEIGHTS.reduce((sum, weight) => sum + weight, 0);
 
 function wideSample(k: number): string {
   const share = (WIDE_WEIGHTS[k]! / WIDE_TOTAL).toFixed(6);
-  return `wide += ${share} * textureLod(shade, uv + ${WIDE_RADIUS} * ${discOffset(k, WIDE_SAMPLES)}, 3.0).r;`;
+  return `wide += ${share} * textureLod(shade, uv + spread * ${WIDE_RADIUS} * ${discOffset(k, WIDE_SAMPLES)}, 3.0).r;`;
 }
 
 export const SHADOW_GLSL = /* glsl */ `
 /* Fraction of light at uv of a shadow map. Its red channel is the part of the sky that the body hides, its green
    channel marks the parts of the body close to the ground, its blue channel is the shadow of the main light. The
    shadows around a contact and of the light are spread over the radius softness. Coarser levels of the map smooth the
-   few samples. */
-float egsShade(sampler2D shade, vec2 uv, float softness) {
+   few samples. spread is the side of the map for one body of the same height, divided by the side of the map. */
+float egsShade(sampler2D shade, vec2 uv, float softness, float spread) {
   vec2 near = vec2(0.0);
   float wide = 0.0;
   ${Array.from({ length: NEAR_SAMPLES }, (_, k) => nearSample(k)).join("\n  ")}

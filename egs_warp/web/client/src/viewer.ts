@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import { Bodies, type Body } from "./bodies";
 import { Overlays, type Layer } from "./overlays";
-import { bytesOf, embeddingOf, floatsOf, indicesOf, splatsOf, type Frame } from "./packets";
+import { bytesOf, embeddingOf, floatsOf, indicesOf, splatsOf, type BodyPart, type Frame } from "./packets";
 import type { FrameSource } from "./frame_source";
 import { Stage } from "./stage";
 
@@ -15,6 +15,8 @@ const GROUND_CHANGE = 0.02;
 const RISE_PER_FRAME = 0.1;
 /** Half of the height that a view of only the body shows, in body heights. */
 const HALF_VIEW_HEIGHT = 1;
+/** Number from which the active mark is that of a selected body (`egsMarked`). */
+const SELECTED = 256;
 export type Preset = "film" | "front" | "side" | "top";
 export type LayerToggle = Layer | "splats" | "scene" | "ground";
 
@@ -29,6 +31,8 @@ export class Viewer extends Stage {
   /** Middle of the body in the first frame. */
   private readonly startCentre: THREE.Vector3;
   private readonly currentCentre = new THREE.Vector3();
+  /** Selected body of a world; undefined if none is selected, or for a run with one body. */
+  private body: number | undefined;
   /** Height of the ground under the body that the camera follows, m. */
   private groundHeight = 0;
   /** Whether the layers of the ground and of the scene are on. */
@@ -42,14 +46,16 @@ export class Viewer extends Stage {
     const { antialiased, height, light } = header.facts;
     const surface = indicesOf(header, "surface");
     const rest = floatsOf(header, "rest");
-    super(canvas, { antialiased, height, surface, nodeCount: rest.length / 3, light });
+    const extent = header.facts.bodies && horizontalExtent(source.frames);
+    super(canvas, { antialiased, height, surface, nodeCount: rest.length / 3, light, extent });
     this.masses = floatsOf(header, "node_mass");
     const positionsAt = (frame: number): Float32Array => source.frames[frame]!.positions;
     const track = { rest, tets: indicesOf(header, "tets"), embedding: embeddingOf(header), positionsAt };
     const relighting = light && { irradiance: light.irradiance, normals: bytesOf(header, "splats_normals") };
     const bodies: Body[] = [{ splats: splatsOf(header, "splats"), track, relighting }];
     if (header.arrays.has("scene_means")) bodies.push({ splats: splatsOf(header, "scene") });
-    this.bodies = new Bodies(bodies, { shadow: this.ground.shadow, hasMarks: header.facts.picking ?? false });
+    const hasMarks = header.facts.picking ?? header.facts.bodies !== undefined;
+    this.bodies = new Bodies(bodies, { shadow: this.ground.shadow, hasMarks });
     this.overlays = new Overlays(header, (frame) => this.computeCentre(frame.positions));
     this.scene.add(this.bodies.object, this.overlays.group);
     this.bounds = this.runBounds();
@@ -100,8 +106,35 @@ export class Viewer extends Stage {
     const centre = this.computeCentre(this.positions);
     if (this.follow) this.followBody(centre, frames[Math.floor(at)] as Frame);
     this.currentCentre.copy(centre);
-    this.ground.cast(this.renderer, this.positions, centre);
+    this.ground.cast(this.renderer, this.positions, this.parts === undefined ? centre : this.middle());
     this.invalidate();
+  }
+
+  /** Bodies of a world; undefined for a run with one body. */
+  get parts(): BodyPart[] | undefined {
+    return this.source.header.facts.bodies;
+  }
+
+  /** Return the index of the body of a world to which a node belongs. */
+  bodyOf(node: number): number {
+    return this.parts?.findIndex(({ nodes: [first, count] }) => node >= first && node < first + count) ?? 0;
+  }
+
+  /** Select a body of a world: brighten it, and follow it and its centre of mass. */
+  select(body: number | undefined): void {
+    const { parts } = this;
+    if (parts === undefined) return;
+    this.body = body;
+    const labels = new Uint8Array(Math.max(...parts.map(({ splats: [first, count] }) => first + count)));
+    parts.forEach(({ splats: [first, count] }, k) => labels.fill(k + 1, first, first + count));
+    this.mark(labels, body === undefined ? -1 : SELECTED + body + 1);
+    this.overlays.resetPath();
+    this.currentCentre.copy(this.computeCentre(this.positions));
+  }
+
+  /** Middle of the box around the nodes of all bodies. */
+  private middle(): THREE.Vector3 {
+    return new THREE.Box3().setFromArray(this.positions).getCenter(new THREE.Vector3());
   }
 
   private get positions(): Float32Array {
@@ -161,6 +194,8 @@ export class Viewer extends Stage {
 
   /** Return the angle about the vertical by which the body has turned relative to its rest pose, rad. */
   private yaw(): number {
+    // The bodies of a world have different rest poses; their `front` is towards the film's camera.
+    if (this.parts !== undefined) return 0;
     const { positions, masses } = this;
     const rest = floatsOf(this.source.header, "rest");
     const [before, now] = [this.computeCentre(rest), this.computeCentre(positions)];
@@ -280,12 +315,15 @@ export class Viewer extends Stage {
   private computeCentre(positions: Float32Array): THREE.Vector3 {
     const sum = new THREE.Vector3();
     let total = 0;
-    this.masses.forEach((mass, k) => {
+    const part = this.body === undefined ? undefined : this.parts?.[this.body];
+    const [first, count] = part?.nodes ?? [0, this.masses.length];
+    for (let k = first; k < first + count; k++) {
+      const mass = this.masses[k]!;
       total += mass;
       sum.x += mass * positions[3 * k]!;
       sum.y += mass * positions[3 * k + 1]!;
       sum.z += mass * positions[3 * k + 2]!;
-    });
+    }
     return sum.divideScalar(total);
   }
 
@@ -298,4 +336,12 @@ export class Viewer extends Stage {
     }
     return box;
   }
+}
+
+/** Return half of the larger horizontal extent of the nodes over all frames, m. */
+function horizontalExtent(frames: Frame[]): number {
+  const box = new THREE.Box3();
+  for (const { positions } of frames) box.union(new THREE.Box3().setFromArray(positions));
+  const size = box.getSize(new THREE.Vector3());
+  return 0.5 * Math.max(size.x, size.y);
 }

@@ -13,6 +13,16 @@ const UP = new THREE.Vector3(0, 0, 1);
 const DIRECTION = new THREE.Vector3(-0.5, 1, -0.25).normalize();
 const DISTANCE = 4;
 
+/** Return half of the larger horizontal extent of several moving bodies in the first frame; undefined for one body. */
+function extentOf({ bodies }: Bundle): number | undefined {
+  const starts = bodies.flatMap(({ cage }) => (cage?.frames[0] === undefined ? [] : [cage.frames[0]]));
+  if (starts.length < 2) return undefined;
+  const box = new THREE.Box3();
+  for (const positions of starts) box.union(new THREE.Box3().setFromArray(positions));
+  const size = box.getSize(new THREE.Vector3());
+  return 0.5 * Math.max(size.x, size.y);
+}
+
 export class BundleStage extends Stage {
   readonly creature: Creature;
   protected readonly bodies: Bodies;
@@ -31,6 +41,7 @@ export class BundleStage extends Stage {
       height: (facts.height ?? 1) * facts.metres_per_unit,
       surface: surfaceOf(bundle),
       nodeCount,
+      extent: extentOf(bundle),
       // The ground and its shadow are in the axes of the bundle.
       light: facts.light,
     });

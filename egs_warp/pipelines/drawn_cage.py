@@ -1,0 +1,79 @@
+"""The cage of a body as players draw it: nodes, tetrahedra and a surface that resembles the body.
+
+Players select bodies and draw shadows with the surface. The surface of a creature is that of its cage. The single
+tetrahedron of a prop does not resemble the prop, so its drawn cage has further nodes on the zero set of its level set,
+which move affinely with the tetrahedron.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.locomotion.world_audit import ContactShape
+from egs_warp.short_repr import short_repr
+
+_CELLS = 12
+"""Number of cells along the longest side of the lattice on which the surface of a prop is triangulated."""
+
+
+@dataclass(frozen=True)
+class DrawnCage:
+    """Cage of N nodes, of which the first C are those of the cage of the solver."""
+
+    __repr__ = short_repr
+
+    nodes: np.ndarray
+    """(N, 3) m, nodes at rest."""
+    tets: np.ndarray
+    """(T, 4) nodes of the tetrahedra."""
+    surface: np.ndarray
+    """(B, 3) nodes of the surface triangles, wound outwards."""
+    weights: np.ndarray
+    """(N - C, 4) barycentric weights of the further nodes in the only tetrahedron; (0, 4) if there are none."""
+
+    @classmethod
+    def of(cls, mesh: TetMesh, shape: ContactShape | None = None) -> DrawnCage:
+        """Return the drawn cage of a body with the cage ``mesh`` at rest. ``shape`` has the level set of a prop; the
+        surface without it is that of the tetrahedra."""
+        if shape is None or len(mesh.tets) > 1:
+            return cls(mesh.nodes, mesh.tets, mesh.boundary_faces(), np.zeros((0, 4)))
+        vertices, faces = _surface(mesh, shape)
+        # A level set has the frame of ``rest_positions`` of the shape, which are the nodes of the cage at rest.
+        matrix = np.vstack([mesh.nodes[mesh.tets[0]].T, np.ones(4)])
+        weights = np.linalg.solve(matrix, np.vstack([vertices.T, np.ones(len(vertices))])).T
+        count = len(mesh.nodes)
+        return cls(np.concatenate([mesh.nodes, vertices]), mesh.tets, faces + count, weights)
+
+    def positions(self, nodes: np.ndarray) -> np.ndarray:
+        """Return the positions (..., N, 3) m for those of the nodes of the cage, (..., C, 3) m."""
+        if len(self.weights) == 0:
+            return nodes
+        return np.concatenate([nodes, np.einsum("vw,...wi->...vi", self.weights, nodes[..., self.tets[0], :])], axis=-2)
+
+
+def _surface(mesh: TetMesh, shape: ContactShape) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3) m and triangles (B, 3) of the zero set of the level set on a coarse lattice; those of the
+    convex hull of the contact points if the body is too thin for the lattice."""
+    from skimage import measure
+
+    counts = np.array(shape.coefficients.shape)
+    step = shape.spacing * float(counts.max()) / _CELLS
+    axes = [np.arange(0.0, shape.spacing * (count - 1) + step, step) for count in counts]
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    values = shape.level_set.evaluate(shape.origin + lattice.reshape(-1, 3))[0].reshape(lattice.shape[:3])
+    if values.min() < 0.0:
+        vertices, faces, _, _ = measure.marching_cubes(values, 0.0)
+        return shape.origin + step * vertices.astype(np.float64), faces.astype(np.int32)
+    points = shape.points(mesh.tets, mesh.nodes)
+    hull = ConvexHull(points)
+    used, faces = np.unique(hull.simplices, return_inverse=True)
+    vertices, faces = points[used], faces.reshape(-1, 3)
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = np.einsum("fi,fi->f", normals, hull.equations[:, :3]) < 0.0
+    faces[inward] = faces[inward][:, ::-1]
+    return vertices, faces.astype(np.int32)

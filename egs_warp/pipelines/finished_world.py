@@ -1,0 +1,151 @@
+"""Finished runs of worlds, read from their folders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from egs_warp.contact.terrain import Solid
+from egs_warp.errors import ArgumentError, UserError
+from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.io.run_folder import is_interrupted
+from egs_warp.io.text import parse_json, read_text
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.locomotion.world_audit import ContactShape
+from egs_warp.pipelines.finished_run import FinishedRun, checked_frame
+from egs_warp.pipelines.world_film import FilmedBody, FilmedWorld
+from egs_warp.short_repr import short_repr
+
+SHAPE = "contact_shape.npz"
+"""Name of the file with the contact points and the level set of a body, in the folder of the body."""
+
+
+def is_world_folder(folder: Path) -> bool:
+    """Return True if ``folder`` contains the finished run of a world."""
+    path = folder / "report.json"
+    if not path.is_file():
+        return False
+    report = parse_json(read_text(path), path)
+    return isinstance(report, dict) and isinstance(report.get("bodies"), dict)
+
+
+@dataclass(frozen=True)
+class FinishedWorld:
+    """Contents of the folder of a finished run of a world."""
+
+    __repr__ = short_repr
+
+    folder: Path
+    bodies: Mapping[str, FinishedRun]
+    """Run of each body by its name, in the order of the world and in its frame."""
+    shapes: Mapping[str, ContactShape]
+    """Contact points and level set of each body."""
+    report: Mapping[str, Any]
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Read the ``folder`` of a world. Raises ``UserError`` if it has no finished run of a world."""
+        if is_interrupted(folder):
+            raise UserError(f"{folder}: the run has not finished; egs-warp resume {folder} continues it")
+        path = folder / "report.json"
+        report = parse_json(read_text(path), path)
+        names = report.get("bodies") if isinstance(report, dict) else None
+        if not isinstance(names, dict) or not names or any(Path(name).name != name for name in names):
+            raise UserError(f"{path}: is not the report of a world; run egs-warp animate again to write it")
+        bodies = {name: FinishedRun.read(folder / name) for name in names}
+        shapes = {name: ContactShape.load(folder / name / SHAPE) for name in names}
+        for name, run in bodies.items():
+            t, shape = run.trajectory, shapes[name]
+            if len(shape.rest_positions) != len(t.rest_positions) or shape.point_tets.max(initial=0) >= len(t.tets):
+                advice = "run egs-warp animate again to write both"
+                raise UserError(f"{folder / name / SHAPE}: belongs to another cage than trajectory.npz; {advice}")
+        return cls(folder, bodies, shapes, report)
+
+    @property
+    def title(self) -> str:
+        """Names of the bodies."""
+        return " \u00b7 ".join(self.bodies)
+
+    @property
+    def first(self) -> FinishedRun:
+        """Run of the first body."""
+        return next(iter(self.bodies.values()))
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """Trajectories of all bodies."""
+        return tuple(run.trajectory for run in self.bodies.values())
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the film."""
+        return self.first.creature.camera
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames at 60 Hz."""
+        # Steps of bodies may be halved differently, so their last times may differ by rounding.
+        return min(run.frame_count for run in self.bodies.values())
+
+    def frame_number(self, frame: int, *, argument: str) -> int:
+        """Return the number of ``frame`` (``FinishedRun.frame_number``)."""
+        return checked_frame(frame, self.frame_count, argument=argument)
+
+    @property
+    def capture_frame(self) -> BodyFrame:
+        """Frame of exported splats: that of the world, in metres."""
+        return BodyFrame(np.eye(3), np.zeros(3), 1.0)
+
+    @property
+    def antialiased(self) -> bool:
+        """True if a capture was trained with antialiasing."""
+        return any(run.antialiased for run in self.bodies.values())
+
+    @cached_property
+    def solids(self) -> tuple[Solid, ...]:
+        """Obstacles, without the ground."""
+        t = self.first.trajectory
+        groups = t.solid_from_plane
+        planes = [Plane(row[:3], float(row[3])) for row in t.planes]
+        return tuple(
+            Solid(tuple(planes[index] for index in np.flatnonzero(groups == solid)))
+            for solid in range(1, int(groups.max(initial=0)) + 1)
+        )
+
+    @cached_property
+    def filmed(self) -> FilmedWorld:
+        """The bodies, ready to be drawn."""
+        count = self.frame_count
+        bodies = {
+            name: FilmedBody(run.deformer(), run.trajectory, run.steps[:count], self.shapes[name])
+            for name, run in self.bodies.items()
+        }
+        return FilmedWorld(bodies, self.solids)
+
+    def splats_of(self) -> Callable[[int], GaussianCloud]:
+        """Return the function that gives the splats of all bodies in a frame; each call overwrites the last result."""
+        filmed = self.filmed
+        deformer = filmed.joint_deformer()
+        return lambda frame: deformer.deform(filmed.poses(frame)).cloud
+
+
+def read_finished(folder: Path, *, background: Path | None = None) -> FinishedRun | FinishedWorld:
+    """Read the finished run of a single capture or of a world. Raises ``UserError`` for any other folder."""
+    if not is_world_folder(folder):
+        return FinishedRun.read(folder, background=background)
+    check_no_background(background)
+    return FinishedWorld.read(folder)
+
+
+def check_no_background(background: Path | None) -> None:
+    """Raise ``ArgumentError`` if a background is given for the run of a world."""
+    if background is not None:
+        raise ArgumentError("background", "a run of a world has no capture behind its bodies", value=background)

@@ -1,0 +1,83 @@
+"""A world job: one run of a world among many."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.push import Push
+from egs_warp.motions.script import Script
+from egs_warp.motions.style import Style
+from egs_warp.pipelines.animate_world import report_of_body
+from egs_warp.pipelines.report import Report
+from egs_warp.pipelines.simulated_run import SimulatedRun
+from egs_warp.pipelines.world import World
+from egs_warp.pipelines.world_run import WorldRun, simulate_world
+from egs_warp.short_repr import short_repr
+
+
+@dataclass(frozen=True)
+class BodyOutcome:
+    """Result of one body of a world job."""
+
+    __repr__ = short_repr
+
+    report: Report
+    """The report, as ``write_world`` writes it."""
+    frames: np.ndarray
+    """(n,) Index of the trajectory's state for each frame of a video at 60 Hz."""
+    trajectory: Trajectory
+    """All solver steps, in the frame of the world."""
+
+
+WorldSummary: TypeAlias = Mapping[str, BodyOutcome]
+"""Results of all bodies by name."""
+
+
+@dataclass(frozen=True)
+class WorldJob:
+    """Arguments of one run of a world: arguments of ``simulate``, under the same names."""
+
+    __repr__ = short_repr
+
+    motions: Mapping[str, Script | str] = field(default_factory=dict)
+    """Motions by the names of the creatures; the other creatures stand."""
+    frames: int | None = None
+    """Number of frames at 60 Hz, the first at rest; None simulates until all bodies have come to rest."""
+    max_seconds: float | None = None
+    """Time limit of the script of each creature, s; None uses the script's own limit."""
+    step: float | None = None
+    """Maximum step size, s; None uses the default."""
+    style: Style | None = None
+    """Style of jumps; None uses the default."""
+    pushes: Mapping[str, tuple[Push, ...]] = field(default_factory=dict)
+    """Pushes by the names of the creatures."""
+    get_up: bool = True
+    """If a creature falls, it tries to get up and continue."""
+
+    def run(self, world: World, *, progress: Callable[[int, int], object] = lambda done, expected: None) -> WorldRun:
+        """Simulate the job in this process; ``progress`` is called with the frames done and expected."""
+        return simulate_world(
+            world,
+            self.motions,
+            frames=self.frames,
+            max_seconds=self.max_seconds,
+            step=self.step,
+            style=self.style,
+            pushes=self.pushes,
+            get_up=self.get_up,
+            progress=progress,
+        )
+
+    def outcome(self, run: WorldRun) -> WorldSummary:
+        """Return report, frames and trajectory of each body."""
+        outcomes = {}
+        for name, result in run.bodies.items():
+            notes = result.unfinished_note() if isinstance(result, SimulatedRun) else ()
+            report = report_of_body(result, notes=notes)
+            outcomes[name] = BodyOutcome(report, result.simulation.frames, result.trajectory)
+        return outcomes

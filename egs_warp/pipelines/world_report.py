@@ -1,0 +1,110 @@
+"""``report.json`` of a world: the state of each body, and the audit of each body and of each pair of bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+
+from egs_warp.locomotion.world_audit import PairAudit, WorldAudit
+from egs_warp.pipelines.end_state import State
+from egs_warp.pipelines.report import JsonValue, Report, exceeded_limits, verdict, versions
+from egs_warp.short_repr import short_repr
+
+SCHEMA_VERSION = 2
+WORLD_AUDIT_LIMITS = {
+    "momentum_residual": 1e-6,
+    "angular_momentum_residual": 1e-6,
+    "unmatched_contacts": 0,
+    "force_residual": 1e-6,
+    "torque_residual": 1e-6,
+    "cone_violation": 1e-4,
+    "friction_gap": 1e-5,
+    "complementarity_gap": 1e-4,
+    "gap_error": 1e-6,
+    "normal_error": 1e-6,
+    "penetration": 1e-2,
+}
+"""Upper limits of ``WorldAudit`` and ``PairAudit``; the works have none. Errors of a contact have the limits of
+contacts with the ground (``AUDIT_LIMITS``)."""
+
+
+@dataclass(frozen=True)
+class WorldReport:
+    """Contents of the ``report.json`` of a world, and the report of each body."""
+
+    __repr__ = short_repr
+
+    bodies: Mapping[str, Report]
+    """Reports by the names of the bodies."""
+    results: Mapping[str, str]
+    """One line for each body: what a creature's motions reached, or how far a prop has moved."""
+    audit: WorldAudit
+    """Audit of the contacts between the bodies and of the momentum of the world."""
+    stopped: bool
+    """True if the run ended at a step that could not be solved."""
+    film: str | None = None
+    """Name of the video in the folder of the run; None if there is no film."""
+    notes: tuple[str, ...] = ()
+    """Notes for the user."""
+    asked: Mapping[str, JsonValue] = field(default_factory=dict)
+    """Contents of the world file, ready for JSON."""
+
+    @property
+    def state(self) -> State:
+        """Worst state of all bodies."""
+        states = tuple(report.state for report in self.bodies.values())
+        return State.STOPPED if self.stopped else State.worst(states)
+
+    def pair_names(self, pair: PairAudit) -> tuple[str, str]:
+        """Return the names of the two bodies of a pair."""
+        names = list(self.bodies)
+        first, second = pair.bodies
+        return names[first], names[second]
+
+    def to_json(self) -> dict[str, JsonValue]:
+        """Return the whole report, ready for JSON."""
+        audit = asdict(self.audit)
+        for pair, entry in zip(self.audit.pairs, audit["pairs"], strict=True):
+            entry["bodies"] = list(self.pair_names(pair))
+        return {
+            "schema": SCHEMA_VERSION,
+            "state": self.state.value,
+            "bodies": {
+                name: {
+                    "state": report.state.value,
+                    "result": self.results[name],
+                    "audit": verdict(report.audit),
+                    "report": f"{name}/report.json",
+                }
+                for name, report in self.bodies.items()
+            },
+            "audit": {**audit, "pairs": list(audit["pairs"])},
+            "verdict": self.verdict(),
+            "film": self.film,
+            "notes": list(self.notes),
+            "asked": dict(self.asked),
+            "versions": versions(),
+        }
+
+    def failures(self) -> list[str]:
+        """Return one line for each body, each pair and the world whose audit has failed."""
+        parts = [(name, verdict(report.audit)) for name, report in self.bodies.items()]
+        parts += [("world", _verdict(asdict(self.audit)))]
+        parts += [(" and ".join(self.pair_names(pair)), _verdict(asdict(pair))) for pair in self.audit.pairs]
+        return [f"{name}: {text}" for name, text in parts if text != _PASSED]
+
+    def verdict(self) -> str:
+        """Return ``audit: passed``, or one line for each body, each pair and the world that has failed."""
+        return "\n".join(self.failures()) or _PASSED
+
+    def summary(self) -> str:
+        """Return one line for each body, and the verdict of the audit."""
+        return "\n".join([*(f"{name}: {result}" for name, result in self.results.items()), self.verdict()])
+
+
+_PASSED = "audit: passed"
+
+
+def _verdict(values: Mapping[str, float]) -> str:
+    exceeded = exceeded_limits(values, WORLD_AUDIT_LIMITS)
+    return f"audit: FAILED: {', '.join(exceeded)}" if exceeded else _PASSED

@@ -1,0 +1,40 @@
+"""The report of a world names each body and each pair whose audit fails."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from types import SimpleNamespace
+from typing import Any
+
+from egs_warp.locomotion.audit import Audit
+from egs_warp.locomotion.world_audit import PairAudit, WorldAudit
+from egs_warp.pipelines.end_state import State
+from egs_warp.pipelines.world_report import WorldReport
+
+
+def _report(*, momentum: float = 0.0, body: dict[str, float] | None = None, **pair: float) -> WorldReport:
+    numbers: dict[str, Any] = {each.name: 0 for each in fields(Audit)} | (body or {})
+    audit = Audit(**numbers)
+    row: Any = SimpleNamespace(audit=audit, state=State.DONE)
+    values: dict[str, Any] = {each.name: 0.0 for each in fields(PairAudit)} | {"bodies": (0, 1)} | pair
+    world = WorldAudit(momentum, 0.0, (PairAudit(**values),))
+    return WorldReport({"king": row, "box": row}, {"king": "jumped", "box": "fell"}, world, stopped=False)
+
+
+def test_a_correct_world_passes() -> None:
+    report = _report(penetration=0.01, friction_work=-3.0)
+    assert report.summary().splitlines() == ["king: jumped", "box: fell", "audit: passed"]
+    written: Any = report.to_json()
+    assert written["verdict"] == "audit: passed" and written["bodies"]["king"]["audit"] == "audit: passed"
+    (pair,) = written["audit"]["pairs"]
+    assert pair["bodies"] == ["king", "box"] and pair["friction_work"] == -3.0
+
+
+def test_each_failure_is_one_line() -> None:
+    report = _report(momentum=float("nan"), body={"energy_residual": 3e-6}, penetration=0.02, unmatched_contacts=2)
+    assert report.summary().splitlines()[2:] == [
+        "king: audit: FAILED: energy_residual 3.0 times its limit",
+        "box: audit: FAILED: energy_residual 3.0 times its limit",
+        "world: audit: FAILED: momentum_residual nan times its limit",
+        "king and box: audit: FAILED: unmatched_contacts 2, not 0, penetration 2.0 times its limit",
+    ]
