@@ -5,16 +5,14 @@ python benchmarks/examples.py [--quick] [--device cpu] [--json PATH] [--plot PAT
 
 from __future__ import annotations
 
-import importlib.util
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness import Row, Table, flags, report
+from harness import Row, Table, example, flags, report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,16 +42,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows.append(row_of(name, summary, contacts))
     print_rows(rows)
     report(options, rows, aims={}, draw=lambda figure: draw(figure, rows), size=(7.0, 3.0))
-
-
-def example(name: str) -> ModuleType:
-    """Import a script of ``examples/``, which is not a package."""
-    path = Path(__file__).resolve().parents[1] / "examples" / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(f"example_{name}", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def row_of(name: str, summary: Row, contacts: np.ndarray) -> Row:

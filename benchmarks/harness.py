@@ -9,6 +9,7 @@ for each null).
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import statistics
@@ -16,6 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -157,6 +159,16 @@ class Table:
             for cell, form, width in zip(cells, self._formats, self._widths, strict=True)
         )
         print("  ".join(aligned).rstrip(), flush=True)
+
+
+def example(name: str) -> ModuleType:
+    """Import a script of ``examples/``, which is not a package."""
+    path = Path(__file__).resolve().parents[1] / "examples" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(f"example_{name}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def environment(options: argparse.Namespace, packages: Sequence[str] = ()) -> dict[str, Any]:

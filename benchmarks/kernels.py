@@ -77,19 +77,21 @@ def arithmetic_kernel(
 @wp.func_native("""
 #if !defined(__CUDA_ARCH__)
     #pragma clang fp contract(fast)
-    typedef float f8 __attribute__((ext_vector_type(8)));
-    f8 chains[8];
-    for (int i = 0; i < 8; ++i) chains[i] = (f8)(float)i;
-    const f8 by = factor, one = start;
+    typedef float f16 __attribute__((ext_vector_type(16)));
+    f16 chains[8];
+    for (int i = 0; i < 8; ++i) chains[i] = (f16)(float)i;
+    const f16 by = factor, one = start;
     for (int step = 0; step < 2048; ++step)
         for (int i = 0; i < 8; ++i) chains[i] = chains[i] * by + one;
-    f8 sum = 0.0f;
+    f16 sum = 0.0f;
     for (int i = 0; i < 8; ++i) sum += chains[i];
-    sum_out.data[row] = sum[0] + sum[1] + sum[2] + sum[3] + sum[4] + sum[5] + sum[6] + sum[7];
+    float total = 0.0f;
+    for (int lane = 0; lane < 16; ++lane) total += sum[lane];
+    sum_out.data[row] = total;
 #endif
 """)
 def vector_chains(row: wp.int32, start: wp.float32, factor: wp.float32, sum_out: wp.array[wp.float32]):
-    """Compute the chains of ``arithmetic_kernel`` in vectors of eight numbers, as compositing on a CPU does."""
+    """Compute the chains of ``arithmetic_kernel`` in vectors of sixteen numbers, as compositing on a CPU does."""
     ...
 
 
@@ -101,7 +103,7 @@ def vector_arithmetic_kernel(
     # Out:
     sum_out: wp.array[wp.float32],
 ):
-    """Compute eight independent chains of multiply and add, eight numbers at once: the peak rate of one core."""
+    """Compute eight independent chains of multiply and add, sixteen numbers at once: the peak rate of one core."""
     i = wp.tid() + first
     vector_chains(i, 1.0, factor, sum_out)
 

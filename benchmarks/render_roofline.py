@@ -80,8 +80,8 @@ def device_limits(device: wp.Device) -> tuple[float, float]:
     target = wp.empty_like(source)
     lanes = 2**20 if device.is_cuda else 64
     sums = wp.zeros(lanes, dtype=wp.float32, device=device)
-    # A core computes eight numbers at once only if the vectors are explicit.
-    kernel, width = (arithmetic_kernel, 1) if device.is_cuda else (vector_arithmetic_kernel, 8)
+    # A core computes sixteen numbers at once only if the vectors are explicit.
+    kernel, width = (arithmetic_kernel, 1) if device.is_cuda else (vector_arithmetic_kernel, 16)
     times = median_ms(
         {
             "copy": lambda: wp.copy(target, source),

@@ -1,6 +1,7 @@
 """Time of a step of a world, as a function of the numbers of bodies and of contacts between them.
 
 python benchmarks/worlds.py [--quick] [--bodies N ...] [--nodes N] [--frames N] [--json PATH] [--plot PATH]
+python benchmarks/worlds.py --starts chess push [--runs N] [--workers N] [--json PATH]
 
 Copies of the pawn jump together for ``--frames`` frames, in three arrangements: far apart, in a row in which neighbours
 touch, and two of them far apart among 30 sleeping props. For each world, the median, mean and largest time of a step
@@ -10,12 +11,17 @@ the first two arrangements.
 Aims on a CPU: ``apart_cost`` (two bodies that never meet take at most 1.1 times as long as two runs of one body),
 ``cpu_two_realtime`` (a frame of two creatures with 250 nodes each takes at most 33 ms, even if they touch),
 ``sleeping_cost`` (two creatures among 30 sleeping props take at most 1.5 times as long as two alone).
+
+With ``--starts``, the named examples are simulated from ``--runs`` random starts instead. Aims: ``chess`` (the
+struck piece lies at the end of 18 of 20 runs), ``push`` (the box is up the ramp at the end of 16 of 20 runs).
 """
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Sequence
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,11 +30,13 @@ from egs_warp.assets import pawn
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.world_rollout import world_steps
 from egs_warp.locomotion.world_stepper import WorldStepper
+from egs_warp.pipelines.animate_world import displacement_text, report_of_body
 from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.simulation import simulate
 from egs_warp.pipelines.world import World
-from harness import Row, Table, flags, report
+from egs_warp.pipelines.world_run import WorldRun
+from harness import Row, Table, example, flags, report, rows_of, workers_flag
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,6 +47,12 @@ APART_SPACING = 3.0
 TOUCHING_SPACING = 0.005
 """Distance between the bases of neighbours that touch when they jump, m."""
 PROPS = 30
+MIN_SUCCESS = {"chess": 18 / 20, "push": 16 / 20}
+"""Minimum fraction of random starts from which an example succeeds."""
+FRAMES = {"chess": 240, "push": 900}
+"""Number of frames of each run from a random start."""
+LYING_TILT = 60.0
+"""Tilt from which a piece lies, degrees."""
 MAX_FRAME = 33.0
 """Maximum time of a frame for ``cpu_two_realtime``, ms."""
 
@@ -93,7 +107,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--bodies", type=int, nargs="*", default=[1, 2, 4, 8, 16], help="numbers of creatures")
     parser.add_argument("--nodes", type=int, default=175, help="requested number of nodes of each cage (default 175)")
     parser.add_argument("--frames", type=int, default=45, help="frames of each world (default 45)")
+    parser.add_argument("--starts", nargs="+", choices=tuple(MIN_SUCCESS), help="examples to run from random starts")
+    workers_flag(parser)
+    parser.add_argument("--runs", type=int, default=20, help="random starts of each example (default 20)")
     options = parser.parse_args(arguments)
+    if options.starts:
+        measure_starts(options)
+        return
     if options.quick:
         options.bodies, options.nodes, options.frames = [1, 2], 50, 6
     scene = pawn(seed=options.seed, device=options.device)
@@ -117,6 +137,46 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, value in exponents.items():
         print(f"{name}: " + ("too few worlds for a fit" if value is None else f"bodies^{value:.2f}"))
     report(options, rows, exponents=exponents, draw=lambda figure: draw(figure, rows), **summary(rows))
+
+
+def measure_starts(options: argparse.Namespace) -> None:
+    """Simulate examples from random starts and count the runs that succeed."""
+    rows: list[Row] = []
+    table = Table(example="<10", seed="d", success="<8", creature="<18", prop="<60", seconds=".1f")
+    seeds = range(1, (2 if options.quick else options.runs) + 1)
+    tasks = [(name, seed) for name in options.starts for seed in seeds]
+    for row in rows_of(run_from_start, tasks, options.workers):
+        rows.append(row)
+        table.row(*row.values())
+    aims: dict[str, bool | None] = {}
+    for name in options.starts:
+        chosen = [row for row in rows if row["example"] == name]
+        count, fell = sum(row["success"] == "yes" for row in chosen), sum(row["creature"] == "fallen" for row in chosen)
+        print(f"{name}: {count} of {len(chosen)} succeed; the creature falls in {fell}")
+        aims[name] = count >= MIN_SUCCESS[name] * len(chosen)
+    report(options, rows, aims=aims)
+
+
+def run_from_start(name: str, seed: int) -> Row:
+    """Simulate an example from the random start ``seed``."""
+    started, module = time.process_time(), example(name)
+    world, motions = module.start(seed)
+    run = simulate(world, motions, frames=FRAMES[name], get_up=False)
+    mover, prop = run.results
+    row: Row = {"example": name, "seed": seed, "success": has_succeeded(module, run)}
+    row |= {"creature": report_of_body(mover).state.value, "prop": displacement_text(prop)}
+    row["seconds"] = time.process_time() - started
+    return row
+
+
+def has_succeeded(module: ModuleType, run: WorldRun) -> str:
+    """Return "yes" if the piece of ``chess`` lies, or the box of ``push`` is up the ramp, else "no"."""
+    prop = run.results[1]
+    body, positions = prop.body.body, prop.simulation.trajectory.positions
+    if hasattr(module, "UP_AT"):
+        return "yes" if body.centre_of_mass(positions[-1])[0] > module.UP_AT else "no"
+    turn = body.best_fit_rotation(positions[-1]) @ body.best_fit_rotation(positions[0]).T
+    return "yes" if turn[2, 2] < np.cos(np.radians(LYING_TILT)) else "no"
 
 
 def exponent(rows: list[Row], arrangement: str) -> float | None:

@@ -1,10 +1,13 @@
 """Read a file that ``egs-warp export RUN --to bundle`` has written; needs only NumPy (docs/concepts/bundle.md)."""
 
+import functools
 import json
 import sys
 import zlib
 
 import numpy as np
+
+_apply = functools.partial(np.einsum, "...j,...ji->...i")
 
 
 class Bundle:
@@ -12,14 +15,18 @@ class Bundle:
 
     def __init__(self, path: str, body: int = 0) -> None:
         with open(path, "rb") as file:
-            assert file.read(8) == b"EGSB\1\0\0\0", f"{path}: not a bundle of version 1"
+            assert file.read(8) == b"EGSB\2\0\0\0", f"{path}: not a bundle of version 2"
             self.text = json.loads(file.read(int.from_bytes(file.read(4), "little")))
             self._data = file.read()
         self.body = self.text["bodies"][body]
-        self.arrays = {name: self._numbers(entry) for name, entry in self.body["arrays"].items()}
-        blocks = [{k: self._numbers(entry) for k, entry in block["arrays"].items()} for block in self.body["blocks"]]
-        self.nodes = np.concatenate([block["origins"][:, None] + block["nodes"] for block in blocks])
-        self._prepare(self.arrays)
+        a = self.arrays = {name: self._numbers(entry) for name, entry in self.body["arrays"].items()}
+        stored = np.concatenate([self._numbers(block["arrays"]["residuals"]) for block in self.body["blocks"]])
+        moved = np.where(stored % 2 == 1, -1.0 - stored // 2, stored // 2).reshape(-1, len(a["order"]), 3)  # in steps
+        for k, (parents, weights) in enumerate(zip(a["parents"], a["weights"], strict=True)):
+            moved[:, k] += np.floor(0.5 + np.einsum("p,fpi->fi", weights, moved[:, parents]))
+        rest = np.floor(a["rest_nodes"].astype(float) / self.body["node_step"] + 0.5)
+        self.nodes = self.body["node_step"] * (rest + np.cumsum(moved[:, np.argsort(a["order"])], axis=0))
+        self._prepare(a)
 
     def _prepare(self, a: dict[str, np.ndarray]) -> None:
         angles, v = np.linalg.norm(a["rotations"], axis=1)[:, None, None] / np.pi, a["rotations"][:, None]
@@ -29,10 +36,8 @@ class Bundle:
         self.corners = a["rest_nodes"][a["cage_tets"]].astype(float)
 
     def _numbers(self, entry: dict) -> np.ndarray:
-        planes = zlib.decompress(self._data[entry["offset"] :][: entry["bytes"]])
-        items = np.frombuffer(planes, np.uint8).reshape(-1, max(entry["shape"][0], 1)).T.copy()
-        stored = items.view(entry["type"]).reshape(entry["shape"])
-        stored = np.cumsum(stored, axis=0, dtype=stored.dtype) if entry.get("delta") else stored
+        planes = np.frombuffer(zlib.decompress(self._data[entry["offset"] :][: entry["bytes"]]), np.uint8)
+        stored = planes.reshape(-1, max(entry["shape"][0], 1)).T.copy().view(entry["type"]).reshape(entry["shape"])
         return np.array(entry["lower"]) + np.array(entry["step"]) * stored if "step" in entry else stored
 
     def frame(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -61,12 +66,7 @@ class Bundle:
         upright = np.linalg.det(plus + minus) > 0
         axes[rows[upright]] = 0.5 * (plus + minus)[upright]
         turns[rows[upright]] = np.linalg.inv(self.axes[rows[upright]]) @ _rotations(axes[rows[upright]])
-        factors = deviations[:, :, None] * axes
-        return means, np.einsum("nki,nkj->nij", factors, factors), turns.swapaxes(1, 2)
-
-
-def _apply(vectors: np.ndarray, maps: np.ndarray) -> np.ndarray:
-    return np.einsum("...j,...ji->...i", vectors, maps)
+        return means, np.einsum("nk,nki,nkj->nij", deviations**2, axes, axes), turns.swapaxes(1, 2)
 
 
 def _rotations(maps: np.ndarray) -> np.ndarray:

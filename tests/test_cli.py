@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
+from egs_warp import __version__
 from egs_warp.assets import pawn
 from egs_warp.cli import _FIRST_EXAMPLES, _attach_negative_values, _parsers, main
 from egs_warp.commands import COMMANDS
@@ -388,6 +389,12 @@ def test_axes_and_planes_are_read() -> None:
     assert np.array_equal(plane.normal, [0.0, 1.0, 0.0]) and plane.offset == -2.0
     with pytest.raises(UserError, match="give one of x, y, z"):
         parse_up("up")
+
+
+def test_the_package_runs_as_a_module() -> None:
+    """``python -m egs_warp`` is the command."""
+    done = subprocess.run([sys.executable, "-m", "egs_warp", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith(__version__)
 
 
 @pytest.mark.parametrize(("given", "taken"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "4"}, "4")])

@@ -54,6 +54,27 @@ def test_example_writes_its_files(tmp_path: Path, name: str, motion: str, asked:
 
 
 @pytest.mark.example
+@pytest.mark.parametrize(
+    ("name", "flags", "bodies"),
+    [
+        ("chess", ["--seed", "1"], ["attacker", "target"]),
+        ("push", ["--seed", "1"], ["pusher", "box"]),
+        ("stairs", [], ["climber"]),
+        ("crowd", ["--count", "2"], ["pawn-1", "pawn-2"]),
+    ],
+)
+def test_example_of_a_world_writes_its_files(tmp_path: Path, name: str, flags: list[str], bodies: list[str]) -> None:
+    small = ["--nodes", "60"]
+    report = example(name).main(["--out", str(tmp_path), "--frames", "4", "--size", "64", *small, *flags])
+    assert list(report.bodies) == bodies and not report.stopped
+    assert "audit: passed" in report.summary()
+    times = [Trajectory.load(tmp_path / body / "trajectory.npz").time for body in bodies]
+    # Small bodies need several steps in a frame.
+    assert all(time[-1] == pytest.approx(3.0 / 60.0) for time in times)
+    assert (tmp_path / "world.mp4").stat().st_size > 0 and (tmp_path / "sheet.png").stat().st_size > 0
+
+
+@pytest.mark.example
 def test_the_optimised_jump_gets_higher() -> None:
     pytest.importorskip("gymnasium")
     heights = example("optimise_jump").main(["--worlds", "4", "--generations", "2", "--frames", "20"])

@@ -74,7 +74,7 @@ def _info(args: argparse.Namespace) -> int:
             up, note = guessed_up(capture)
             notes = (*notes, note)
         notes = (*notes, *scene_notes(cloud, plane.normal if plane is not None else up))
-    with info_bar() as begins:
+    with info_bar(checks_balance=args.muscles is not None) as begins:
         info = inspect_capture(
             cloud,
             source=args.capture,

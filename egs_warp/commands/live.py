@@ -216,7 +216,10 @@ def _session(args: argparse.Namespace, source: _Source, *, begin_stage: Callable
 
         creature = make_creature(source.cloud, up=source.up, plane=source.plane, options=options, progress=begins)
         begins("split")
-        drawn_as = live_render_data(creature, presplit_gaussians(creature), light=source.light)
+        hides_ground = source.background is None and source.ground is None
+        drawn_as = live_render_data(
+            creature, presplit_gaussians(creature, hides_ground=hides_ground), light=source.light
+        )
     if source.front is None:
         print_note(creature.front.description(creature.frame))
     session_options = SessionOptions(source=Path(args.capture).name, takes=args.out, muscles_file=args.muscles)

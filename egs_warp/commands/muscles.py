@@ -61,7 +61,7 @@ def _muscles(args: argparse.Namespace) -> int:
     normal = plane.normal if plane is not None else up
     if front is not None and normal is not None:
         check_front(normal, front)
-    with info_bar() as begins:
+    with info_bar(checks_balance=args.muscles is not None) as begins:
         begins("cage")
         standing = place_cage(capture.cloud, up=up, plane=plane)
         begins("front")

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
+from scipy.special import expit, logit
+from scipy.stats import norm
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.plane import Plane
@@ -23,6 +25,8 @@ _TRANSPARENT_LOGIT = -16.0
 """Opacity logit of a hidden Gaussian, whose opacity of 1e-7 no renderer draws."""
 _THIRD_BELOW = 0.43
 """Height of the mean above a plane at which a third of a normal distribution lies below it, in standard deviations."""
+_CUT_DEVIATIONS = 2.0
+"""Maximum distance from a plane of the mean of a Gaussian that is cut at it, in standard deviations."""
 MAX_VALUE, MAX_LOG_SCALE = 1e18, 41.0
 """Maximum magnitude of any number of a cloud, and maximum logarithm of a standard deviation: squares of numbers within
 these limits are finite in single precision."""
@@ -227,17 +231,62 @@ def hidden_below(cloud: GaussianCloud, plane: Plane, *, margin: float) -> Gaussi
     """Return ``cloud`` with the Gaussians below ``plane`` made transparent; number and order do not change.
 
     A Gaussian is below the plane if its mean is more than ``margin`` (world units) below it, or if a third of its mass
-    is below the plane and the point one standard deviation below its mean is deeper than four margins.
+    is below the plane and the point one standard deviation below its mean is deeper than two margins.
     """
     heights = plane.heights(cloud.means.numpy())
     axes = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
     along = np.einsum("i,nij->nj", plane.normal, axes) * np.exp(cloud.log_scales.numpy().astype(np.float64))
     spreads = np.linalg.norm(along, axis=1)
-    below = (heights < -margin) | ((heights < _THIRD_BELOW * spreads) & (heights - spreads < -4.0 * margin))
+    below = (heights < -margin) | ((heights < _THIRD_BELOW * spreads) & (heights - spreads < -2.0 * margin))
     if not below.any():
         return cloud
     logits = np.where(below, np.float32(_TRANSPARENT_LOGIT), cloud.opacity_logits.numpy())
     return replace(cloud, opacity_logits=wp.array(logits, dtype=wp.float32, device=cloud.device))
+
+
+def cut_at(cloud: GaussianCloud, plane: Plane) -> GaussianCloud:
+    """Return ``cloud`` with each Gaussian that crosses ``plane`` replaced by one above it.
+
+    The new Gaussian has the mean and the covariance of the part above the plane: for the distance h from the plane and
+    the variance s^2 along its normal n, a = -h / s and l = phi(a) / (1 - Phi(a)),
+
+        mean' = mean + l C n / s,    C' = C - l (l - a) (C n) (C n)^T / s^2.
+
+    The opacity is multiplied by the part above the plane, 1 - Phi(a). Colours, number and order do not change.
+    Gaussians of which less than 2 % are below the plane, and those with less than 2 % above it, remain as they are.
+    """
+    heights = plane.heights(cloud.means.numpy()).astype(np.float64)
+    axes = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
+    factors = axes * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :]
+    along = np.einsum("i,nij->nj", plane.normal, factors)
+    spreads = np.linalg.norm(along, axis=1)
+    rows = np.flatnonzero(np.abs(heights) < _CUT_DEVIATIONS * spreads)
+    if len(rows) == 0:
+        return cloud
+    ratio = -heights[rows] / spreads[rows]
+    hazard = norm.pdf(ratio) / norm.sf(ratio)
+    # (k, 3): C n / s.
+    lean = np.einsum("nij,nj->ni", factors[rows], along[rows] / spreads[rows, None])
+    covariances = factors[rows] @ factors[rows].transpose(0, 2, 1)
+    covariances -= (hazard * (hazard - ratio))[:, None, None] * lean[:, :, None] * lean[:, None, :]
+    variances, vectors = np.linalg.eigh(covariances)
+    vectors[:, :, 0] *= np.linalg.det(vectors)[:, None]
+    # The smallest axis of a flat Gaussian may have no variance left in double precision.
+    variances = np.maximum(variances, np.exp(2.0 * cloud.log_scales.numpy()[rows].min(axis=1, keepdims=True) - 6.0))
+    means, rotations, log_scales, logits = (getattr(cloud, name).numpy().copy() for name in ARRAYS[:4])
+    means[rows] += hazard[:, None] * lean
+    rotations[rows] = Rotation.from_matrix(vectors).as_quat()[:, [3, 0, 1, 2]]
+    log_scales[rows] = 0.5 * np.log(variances)
+    logits[rows] = logit(np.maximum(norm.sf(ratio) * expit(logits[rows].astype(np.float64)), expit(_TRANSPARENT_LOGIT)))
+    return GaussianCloud.from_numpy(
+        means,
+        rotations,
+        log_scales,
+        logits,
+        cloud.sh.numpy(),
+        antialiased=cloud.antialiased,
+        device=str(cloud.device),
+    )
 
 
 def most_visible(cloud: GaussianCloud, count: int) -> GaussianCloud:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.bundle_arrays import PackedArray, indices, quantised
 from egs_warp.io.bundle_file import BYTE_ZERO, HEAD, MAGIC, VERSION, Carrier, read_valid_file
+from egs_warp.io.bundle_track import NodeTrack, TrackPredictor, whole_steps
 from egs_warp.io.raw import logits_from_opacities
 from egs_warp.version import __version__
 
@@ -110,29 +111,27 @@ def bundle_file(bundle: Bundle) -> bytes:
         return entries
 
     bodies: list[dict[str, Any]] = []
+    moving: list[tuple[dict[str, Any], NodeTrack]] = []
     for body in bundle.bodies:
         cage = body.cage
-        facts = {"name": body.name, "count": body.splats.count, "degree": body.splats.sh_degree}
+        facts: dict[str, Any] = {"name": body.name, "count": body.splats.count, "degree": body.splats.sh_degree}
         facts |= {"antialiased": body.splats.antialiased}
+        arrays = _splat_arrays(body.splats)
         if cage is not None:
-            facts |= {"max_stretch": cage.max_stretch}
-        arrays = {**({} if cage is None else _cage_arrays(cage)), **_splat_arrays(body.splats)}
+            track = NodeTrack.fitted(cage.rest_nodes, cage.nodes)
+            moving.append((facts, track))
+            facts |= {"max_stretch": cage.max_stretch, "node_step": track.step, "node_error": track.error}
+            arrays = {**_cage_arrays(cage), **track.predictor.arrays(), **arrays}
         if body.normals is not None:
             arrays["normals"] = quantised(body.normals, np.uint8, step=_NORMAL_STEP, lower=-BYTE_ZERO * _NORMAL_STEP)
-        bodies.append({**facts, "arrays": stored(arrays)})
-    moving = [(facts, body.cage) for facts, body in zip(bodies, bundle.bodies, strict=True) if body.cage is not None]
-    for facts, _ in moving:
-        facts |= {"blocks": [], "node_error": 0.0}
+        facts |= {"arrays": stored(arrays)} | ({} if cage is None else {"blocks": []})
+        bodies.append(facts)
     # Blocks of all bodies for the same time are adjacent in the file, so that all bodies can move as soon as possible.
     for first in range(0, bundle.frames, BLOCK_FRAMES):
-        for facts, cage in moving:
-            nodes = cage.nodes[first : first + BLOCK_FRAMES]
-            origins, offsets = _quantised_track(nodes)
-            written = origins.numbers[:, None].astype(np.float64) + offsets.numbers
-            error = float(np.linalg.norm(written - nodes, axis=2).max())
-            facts["node_error"] = max(facts["node_error"], error)
-            arrays = stored({"origins": origins, "nodes": offsets})
-            facts["blocks"].append({"first": first, "frames": len(nodes), "arrays": arrays})
+        for facts, track in moving:
+            displacements = track.displacements[first : first + BLOCK_FRAMES]
+            arrays = stored({"residuals": track.predictor.residuals(displacements)})
+            facts["blocks"].append({"first": first, "frames": len(displacements), "arrays": arrays})
     text = json.dumps(
         {
             "format": "egs-bundle",
@@ -158,7 +157,8 @@ def read_bundle(path: Path) -> Bundle:
         numbers = {name: array.numbers for name, array in arrays.items()}
         cage = None
         if "blocks" in body:
-            nodes = np.concatenate([block["origins"].numbers[:, None] + block["nodes"].numbers for block in blocks])
+            predictor, step = TrackPredictor.from_arrays(arrays), body["node_step"]
+            displacements = np.concatenate([predictor.displacements(block["residuals"]) for block in blocks])
             tets = numbers["tets"].astype(np.int32)
             carriers = arrays["carriers"].stored
             arms = arrays["arm_tets"].stored
@@ -173,7 +173,7 @@ def read_bundle(path: Path) -> Bundle:
                 arm_lengths=numbers["arm_lengths"],
                 arm_bulges=numbers["arm_bulges"],
                 max_stretch=body["max_stretch"],
-                nodes=nodes,
+                nodes=step * (whole_steps(numbers["rest_nodes"], step) + np.cumsum(displacements, axis=0)),
             )
         normals = numbers.get("normals")
         bodies.append(BundleBody(body["name"], _cloud(numbers, body["antialiased"]), cage, normals))
@@ -245,16 +245,3 @@ def _cage_arrays(cage: BundleCage) -> dict[str, PackedArray]:
         "arm_lengths": quantised(cage.arm_lengths, np.uint16, step=_ARM_STEP, lower=0.0),
         "arm_bulges": quantised(cage.arm_bulges, np.uint16, step=_ARM_STEP, lower=0.0),
     }
-
-
-def _quantised_track(nodes: np.ndarray) -> tuple[PackedArray, PackedArray]:
-    """Return the lower corner (f, 3) of the body in each frame, and the quantised positions (f, N, 3) relative to it.
-
-    The quantisation error depends on the size of the body, not on the distance that it moves.
-    """
-    lows = nodes.min(axis=1)
-    origins = lows.astype(np.float32)
-    # Round the origins down, so that no position is below its origin.
-    origins = np.where(origins > lows, np.nextafter(origins, np.float32(-np.inf)), origins)
-    offsets = quantised(nodes - origins[:, None].astype(np.float64), np.uint16, lower=0.0)
-    return PackedArray(origins), replace(offsets, delta=True)

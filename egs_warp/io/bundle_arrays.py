@@ -37,8 +37,6 @@ class PackedArray:
     """(m,) float64, quantisation steps along the last axis, or (1,) for all; None without quantisation."""
     error: float | None = None
     """Maximum absolute rounding error; None without quantisation."""
-    delta: bool = False
-    """True if the file stores the first item, and then the difference of each item from its predecessor."""
 
     @property
     def numbers(self) -> np.ndarray:
@@ -50,8 +48,6 @@ class PackedArray:
     def data(self) -> bytes:
         """Return the deflated byte planes: byte b of component c of all items, for c and then b."""
         stored = self.stored
-        if self.delta:
-            stored = np.concatenate([stored[:1], np.diff(stored, axis=0)])
         width = stored.dtype.itemsize * math.prod(stored.shape[1:])
         planes = np.ascontiguousarray(stored).view(np.uint8).reshape(len(stored), width).T
         return _deflated(np.ascontiguousarray(planes).tobytes())
@@ -66,7 +62,7 @@ class PackedArray:
         }
         if self.lower is not None and self.step is not None:
             entry |= {"lower": self.lower.tolist(), "step": self.step.tolist(), "error": self.error}
-        return entry | ({"delta": True} if self.delta else {})
+        return entry
 
     @classmethod
     def from_file(cls, entry: dict[str, Any], data: bytes) -> PackedArray:
@@ -89,13 +85,10 @@ class PackedArray:
             raise ValueError(f"its bytes do not inflate to the {size} bytes of an array of shape {shape}")
         rows = np.frombuffer(planes, np.uint8).reshape(width, shape[0]).T
         stored = np.ascontiguousarray(rows).view(dtype).reshape(shape)
-        delta = entry.get("delta", False)
-        if delta:
-            stored = np.cumsum(stored, axis=0, dtype=dtype)
         if "step" not in entry:
-            return cls(stored, delta=delta)
+            return cls(stored)
         lower, step = (np.array(entry[name], np.float64) for name in ("lower", "step"))
-        return cls(stored, lower, step, entry["error"], delta)
+        return cls(stored, lower, step, entry["error"])
 
 
 def _deflated(data: bytes) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -16,12 +17,13 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.io.bundle_arrays import PackedArray
+from egs_warp.io.bundle_track import PARENTS, WEIGHT_STEP
 from egs_warp.io.limits import MAX_COORDINATE, MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.planes import light_from_json
 
 MAGIC = b"EGSB"
 """First bytes of a bundle."""
-VERSION = 1
+VERSION = 2
 """Version of the format."""
 HEAD = struct.Struct("<4sII")
 """Magic bytes, version, and length of the JSON text in bytes."""
@@ -29,7 +31,7 @@ BYTE_ZERO = 128
 """Byte that stands for zero in the arrays that a player does not decode: SH coefficients above band 0, and normals."""
 _ROUNDING = 1.0 + 1e-3
 """Maximum ratio of a stated error to half a step; above 1, because steps are rounded to double precision."""
-_INDICES = ("cage_tets", "surface", "tets", "carriers", "arm_tets")
+_INDICES = ("cage_tets", "surface", "tets", "carriers", "arm_tets", "order", "parents", "residuals")
 """Names of the arrays of integers."""
 
 
@@ -201,9 +203,10 @@ def _body_problems(
         expected |= {"rest_nodes": (nodes, 3), "cage_tets": (tets, 4), "surface": (len(arrays["surface"].stored), 3)}
         expected |= {"tets": (count,), "carriers": (count,), "arm_bulges": (arms, 3)}
         expected |= {name: (arms, 6) for name in ("arm_tets", "arm_shares", "arm_lengths")}
+        expected |= {"order": (nodes,), "parents": (nodes, PARENTS), "weights": (nodes, PARENTS)}
     wrong = [name for name, shape in expected.items() if arrays[name].stored.shape != shape]
     yield from (f"{name} has shape {list(arrays[name].stored.shape)}, not {list(expected[name])}" for name in wrong)
-    for name in {"bands", "normals"} & expected.keys() if not wrong else ():
+    for name in {"bands", "normals", "weights"} & expected.keys() if not wrong else ():
         array = arrays[name]
         if array.stored.dtype != np.uint8 or array.step is None or array.lower is None:
             yield f"{name} are not uint8 with a step"
@@ -219,6 +222,14 @@ def _body_problems(
     own = arrays["tets"].stored[arrays["carriers"].stored == Carrier.ARMS, None].astype(ends.dtype)
     if (ends + own).max(initial=0) >= tets:
         yield f"arm_tets has the index {(ends + own).max()}, but there are {tets} tetrahedra"
+    if not np.array_equal(np.sort(arrays["order"].stored), np.arange(nodes)):
+        yield "order does not have each node once"
+    if (arrays["parents"].stored >= np.maximum(np.arange(nodes), 1)[:, None]).any():
+        yield "parents has a position that is not before its own"
+    if not np.all(arrays["weights"].step == WEIGHT_STEP):
+        yield f"the step of weights is not {WEIGHT_STEP:g}"
+    if arrays["weights"].numbers[:1].any():
+        yield "the weights of the first position are not 0"
     yield from _track_problems(body, frames, nodes, blocks)
 
 
@@ -226,20 +237,18 @@ def _track_problems(
     body: dict[str, Any], frames: int, nodes: int, blocks: tuple[Mapping[str, PackedArray], ...]
 ) -> Iterator[str]:
     """Yield the defects in the blocks of a body of ``nodes`` nodes."""
-    first, bound = 0, 0.0
+    first = 0
     for number, (facts, block) in enumerate(zip(body["blocks"], blocks, strict=True)):
         place = f"blocks/{number}"
         if facts["first"] != first:
             yield f"{place}: begins at frame {facts['first']}, not {first}"
         first += facts["frames"]
-        shapes = {"origins": (facts["frames"], 3), "nodes": (facts["frames"], nodes, 3)}
-        for name, shape in shapes.items():
-            if block[name].stored.shape != shape:
-                yield f"{place}: {name} has shape {list(block[name].stored.shape)}, not {list(shape)}"
-        if block["nodes"].step is not None:
-            # The bound is half a step in each of three directions.
-            bound = max(bound, 0.5 * float(np.linalg.norm(np.broadcast_to(block["nodes"].step, 3))))
+        shape = (facts["frames"] * nodes * 3,)
+        if block["residuals"].stored.shape != shape:
+            yield f"{place}: residuals has shape {list(block['residuals'].stored.shape)}, not {list(shape)}"
     if first != frames:
         yield f"its blocks have {first} frames, but the bundle has {frames}"
+    # Half a step in each of three directions.
+    bound = 0.5 * math.sqrt(3.0) * body["node_step"]
     if body["node_error"] > _ROUNDING * bound:
-        yield f"node_error {body['node_error']:.3g} is larger than the steps of the nodes allow, {bound:.3g}"
+        yield f"node_error {body['node_error']:.3g} is larger than the step of the nodes allows, {bound:.3g}"

@@ -88,9 +88,13 @@ class BodyRun:
         parts: Callable[[], Path] | None = None,
         resume: Path | None = None,
         kicks: Kicks = lambda time, dt: None,
+        has_others: bool = False,
     ) -> None:
-        """Begin at ``start``; arguments as for ``rollout_steps``."""
-        self.stepper, self._motion, self._kicks = stepper, motion, kicks
+        """Begin at ``start``; arguments as for ``rollout_steps``.
+
+        ``has_others`` is True in a world with other bodies.
+        """
+        self.stepper, self._motion, self._kicks, self._has_others = stepper, motion, kicks, has_others
         self._up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
         self.state, self.memory = start, stepper.initial_memory()
         self.reports: list[StepReport] = []
@@ -116,8 +120,28 @@ class BodyRun:
     def objectives(self, dt: float) -> Sequence[AnyObjective]:
         """Return the objectives of the motion for the next step of ``dt`` s."""
         with one_blas_thread():
-            report = _without_pushes(self.reports[-1], self._up) if self.reports else None
+            report = self._support_report() if self.reports else None
             return self._motion.objectives(self.state, report, dt)
+
+    def _support_report(self) -> StepReport:
+        """Return the last report with only the contacts that support the body: those with the ground, and those with
+        other bodies below it. A motion must not treat a body that pushes it from the side as its ground."""
+        report = self.reports[-1]
+        if not self._has_others:
+            return report
+        contacts = report.contacts
+        kept = (contacts.faces >= 0) | (contacts.axes[:, 0] @ self._up > _MIN_SUPPORT_COSINE)
+        contacts = replace(contacts, **{name: value[kept] for name, value in contacts.batched_fields()})
+        # The weights of a point of another body sum to -1.
+        weights = contacts.weights / contacts.weights.sum(axis=1, keepdims=True)
+        gaps, _ = self.stepper.detector.gaps(report.state.positions)
+        return replace(
+            report,
+            contacts=replace(contacts, weights=np.where(contacts.faces[:, None] < 0, weights, contacts.weights)),
+            forces=report.forces[kept],
+            end_gaps=report.end_gaps[kept],
+            min_gap=float(gaps.min()),
+        )
 
     def begin_step(
         self, objectives: Sequence[AnyObjective], dt: float, activations: np.ndarray | None = None
@@ -291,18 +315,3 @@ def rollout_steps(
         if stopped or resting == REST_FRAMES or aborted():
             break
     return run.result(stopped=stopped)
-
-
-def _without_pushes(report: StepReport, up: np.ndarray) -> StepReport:
-    """Return ``report`` without the contacts with other bodies that push the body sideways or down, for the unit vector
-    ``up`` (3,): a motion must not treat a body that pushes it as its ground."""
-    contacts = report.contacts
-    kept = (contacts.faces >= 0) | (contacts.axes[:, 0] @ up > _MIN_SUPPORT_COSINE)
-    if kept.all():
-        return report
-    return replace(
-        report,
-        contacts=replace(contacts, **{name: value[kept] for name, value in contacts.batched_fields()}),
-        forces=report.forces[kept],
-        end_gaps=report.end_gaps[kept],
-    )

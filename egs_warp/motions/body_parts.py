@@ -13,6 +13,8 @@ from egs_warp.muscles.skeleton import Branch, Skeleton, skeleton
 
 _TOP = 0.25
 """Maximum depth of the tip of the head below the highest tip, in body heights; a raised tail may be higher."""
+_TOP_DEPTH = 0.15
+"""Depth in body heights over which the tops of a branch and of the rest of the body are compared."""
 _NECK = 1.15
 """Minimum ratio of the radii above and below a neck to the radius of the neck."""
 _NECK_WINDOW = 3
@@ -41,8 +43,8 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
 
     Candidates for the head are branches of the skeleton that end near the top. A candidate consists of the sections
     above its highest neck and the branches that start there; a small branch without a neck is a candidate as a whole.
-    The head is the candidate with the largest mass. A neck is a section between clearly thicker sections above and
-    below.
+    A candidate beside which the body ends higher, with a heavier top, is a raised arm or what it holds. The head is the
+    candidate with the largest mass. A neck is a section between clearly thicker sections above and below.
 
     Args:
         mesh: cage at rest, m.
@@ -67,7 +69,7 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
         above_necks = [nodes_of(_above(shape, branch, neck), _MIN_MASS, 1.0) for neck in _necks(branch)]
         whole = nodes_of(_own_sections(branch), _MIN_MASS, _MAX_BRANCH_MASS)
         nodes = next((nodes for nodes in above_necks if nodes is not None), whole)
-        if nodes is not None:
+        if nodes is not None and not _is_raised_arm(nodes, heights, node_mass):
             heads.append((float(node_mass[nodes].sum()), branch, nodes))
     _, head_branch, head = max(heads, key=lambda entry: entry[0], default=(0.0, None, None))
     branches = [
@@ -76,6 +78,15 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
         if branch is not head_branch and not branch.starts_on_ground and (branch.ends_freely or branch.own[0])
     ]
     return ShapeParts(head, tuple(nodes for nodes in branches if nodes is not None))
+
+
+def _is_raised_arm(part: np.ndarray, heights: np.ndarray, node_mass: np.ndarray) -> bool:
+    """True if the rest of the body ends higher than a ``part`` (k,) of its nodes, and its top is heavier."""
+    rest = np.setdiff1d(np.arange(len(heights)), part)
+    depth = _TOP_DEPTH * float(np.ptp(heights))
+    tops = [nodes[heights[nodes] > heights[nodes].max() - depth] for nodes in (part, rest)]
+    own, other = (float(node_mass[top].sum()) for top in tops)
+    return heights[rest].max() > heights[part].max() and other > own
 
 
 def _ending_near_the_top(shape: Skeleton, depth: float) -> list[Branch]:

@@ -130,6 +130,14 @@ class Stance:
         return replace(self, ground=replace(self.ground, axes=self.ground.axes @ turn.T))
 
 
+@dataclass(frozen=True)
+class JudgedOutcome:
+    """Base of measured results that contain a judgement of targets beyond those of ``MotionOutcome``."""
+
+    failures: tuple[str, ...]
+    """Description of each missed target, for the report."""
+
+
 class BodyMotion(Protocol):
     """Motion of a body: a state machine that ends at rest."""
 

@@ -1,31 +1,33 @@
-"""Motions towards other bodies of a world: ``face NAME``, ``walk to NAME`` and ``jump to NAME``.
+"""Motions towards other bodies of a world, such as ``face NAME``, ``kick NAME`` and ``push NAME to X,Y``.
 
-They are a turn, a walk and a jump of the registry. Their targets are computed from the position of the other body when
-the motion starts.
+``face``, ``jump to`` and ``kick`` are computed from the position of the other body when they start. The walks are
+steered while they run: they follow a body that moves, and walk round other bodies and obstacles.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from egs_warp.errors import UserError, did_you_mean
-from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.motions.repertoire import frames_of_request, tasks_of_request
+from egs_warp.fem.body import GRAVITY
+from egs_warp.motions.jump_plan import JumpTarget
+from egs_warp.motions.kick import Kick
+from egs_warp.motions.other_body import OtherBody, radius_of
+from egs_warp.motions.repertoire import MOTIONS, frames_of_request, tasks_of_request
 from egs_warp.motions.request import MAX_TARGET, MotionRequest
 from egs_warp.motions.script import Script
 from egs_warp.motions.script import motion as script
 from egs_warp.motions.sequence import BodyMotion, Stance
 from egs_warp.motions.stand import StandFor
+from egs_warp.motions.steering import Policy, Steered, is_blocked
+from egs_warp.motions.steering_targets import AvoidBody, FollowBody, PushTo, WalkToBody, WalkToPoint
+from egs_warp.motions.values import Value
 
-TOWARDS = {"face": "turn 90", "walk to": "walk to 1,0", "jump to": "jump 1"}
-"""Motion of the registry on which each motion towards a body is based."""
-_CLEARANCE = 0.1
-"""Gap to the other body at which a walk ends, in body heights."""
 _MIN_TURN = np.radians(3.0)
 """Angle to the other body, in radians, below which ``face`` is a stand instead of a turn."""
 _NO_TURN_TIME = 0.1
@@ -33,27 +35,43 @@ _NO_TURN_TIME = 0.1
 _TIME_FACTOR = 2.0
 """Ratio of the time limit to the limit that the motion would have at the start of the run. It exceeds 1 because the
 other body may move away."""
+_MIN_SPEED, _EXTRA_TIME = 0.04, 12.0
+"""Speed in sqrt(g H), a third of the commanded one, and time in seconds to turn, from which the time limit of a steered
+walk is computed."""
+_MAX_PLACE = 1e4
+"""Largest coordinate of a target of ``push``, m."""
+
+
+def _gap(default: float) -> Value:
+    return Value("gap", default, 0.0, MAX_TARGET, "body heights")
+
+
+_SECONDS = Value("seconds", 5.0, 0.0, 60.0, "seconds", is_exclusive=True)
+TOWARDS: Mapping[str, tuple[Value, ...]] = {
+    "face": MOTIONS["turn"].parameters[1:],
+    "walk to": (_gap(0.1),),
+    "stop before": (_gap(0.5),),
+    "jump to": MOTIONS["jump"].parameters[1:],
+    "kick": (
+        Value("distance", 1.2, 0.0, MAX_TARGET, "body heights", is_exclusive=True),
+        Value("height", 0.45, 0.0, MAX_TARGET, "body heights", is_exclusive=True),
+    ),
+    "follow": (_SECONDS, _gap(0.2)),
+    "avoid": (_SECONDS, _gap(0.5)),
+    "push": (),
+}
+"""Parameters of each motion towards a body, in the order in which numbers without names are read."""
 
 
 @dataclass(frozen=True)
-class OtherBody:
-    """Another body of the world. A motion measures its position at the time at which it starts."""
+class _Piece:
+    """One motion towards a body, parsed."""
 
-    body: SoftBody
-    state: Callable[[], BodyState]
-    """Function that returns its current state."""
-
-    def place(self, stance: Stance) -> tuple[np.ndarray, float]:
-        """Return the centre of mass (2,) m in the ground frame of ``stance``, and the approximate distance, in metres,
-        between the centres of the two bodies at which they touch."""
-        positions = self.state().positions
-        local = stance.ground.local(positions)
-        return self.body.centre_of_mass(local)[:2], _radius(stance.ground.local(stance.standing)) + _radius(local)
-
-
-def _radius(local: np.ndarray) -> float:
-    """Return half of the mean horizontal extent of nodes (N, 3) m."""
-    return 0.25 * float(np.ptp(local[:, :2], axis=0).sum())
+    kind: str
+    name: str
+    values: Mapping[str, float]
+    place: np.ndarray | None = None
+    """(2,) m, target of a push in the frame of the world."""
 
 
 def script_among(text: str, others: Mapping[str, OtherBody], stance: Stance) -> Script:
@@ -68,30 +86,27 @@ def script_among(text: str, others: Mapping[str, OtherBody], stance: Stance) -> 
         UserError: for the first mistake.
     """
     requests: list[MotionRequest] = []
-    for number, piece in enumerate(_pieces(text), start=1):
-        kind, name, rest = _split(piece)
-        if kind is None:
-            requests += script(piece).requests
+    for number, text_of_piece in enumerate(_pieces(text), start=1):
+        where = f"motion {number} ({text_of_piece!r})"
+        piece = _parse(text_of_piece, where)
+        if piece is None:
+            requests += _among(script(text_of_piece).requests, others, stance)
             continue
-        if name not in others:
+        if piece.name not in others:
             known = f"give one of {', '.join(others)}" if others else "the world has no other body"
-            raise UserError(f"motion {number} ({piece!r}): no body {name!r}{did_you_mean(name, others)}; {known}")
-        (base,) = script(f"{TOWARDS[kind]} {rest}").requests
-        if base.repeat != 1:
-            raise UserError(f"motion {number} ({piece!r}): it cannot be repeated; write it once more")
+            raise UserError(f"{where}: no body {piece.name!r}{did_you_mean(piece.name, others)}; {known}")
         asked: dict[str, float] = {}
-        begin = partial(_begin, kind, base, others[name], asked)
-        nearest = _with_target(kind, base, *others[name].place(stance), stance.body.height)
-        seconds = _TIME_FACTOR * frames_of_request(nearest) / 60.0
-        requests.append(MotionRequest(f"{kind} {name}", asked, begin=begin, seconds=seconds, layers=base.layers))
+        seconds = _time_limit(piece, others[piece.name], stance)
+        begin = partial(_begin, piece, others, asked)
+        requests.append(MotionRequest(f"{piece.kind} {piece.name}", asked, begin=begin, seconds=seconds))
     return Script(tuple(requests))
 
 
 def check_motion(text: str) -> None:
     """Raise ``UserError`` for a mistake in motions that does not depend on the names of other bodies."""
-    for piece in _pieces(text):
-        kind, _, rest = _split(piece)
-        script(piece if kind is None else f"{TOWARDS[kind]} {rest}").frames()
+    for number, piece in enumerate(_pieces(text), start=1):
+        if _parse(piece, f"motion {number} ({piece!r})") is None:
+            script(piece).frames()
 
 
 def _pieces(text: str) -> list[str]:
@@ -99,44 +114,153 @@ def _pieces(text: str) -> list[str]:
     return [piece.strip() for piece in re.split(r",(?!\s*[-+.]?\d)", text)]
 
 
-def _split(piece: str) -> tuple[str | None, str, str]:
-    """Return the kind, the name of the other body and the remaining text of a motion towards a body; the kind of other
-    motions is None."""
-    for kind in TOWARDS:
+def _parse(piece: str, where: str) -> _Piece | None:
+    """Parse a motion towards a body; None for other motions."""
+    for kind, parameters in TOWARDS.items():
         match = re.fullmatch(rf"{kind}\s+([A-Za-z_][\w-]*)(?![\w=-])\s*(.*)", piece, re.IGNORECASE)
-        if match is not None and not match[2].startswith("="):
-            return kind, match[1], match[2]
-    return None, "", ""
+        if match is None or match[2].startswith("="):
+            continue
+        name, words = match[1], match[2].split()
+        if kind == "push":
+            return _Piece(kind, name, {}, _place(match[2], where))
+        return _Piece(kind, name, _values(kind, parameters, words, where))
+    word = piece.split(maxsplit=1)[0].lower() if piece else ""
+    kinds = [kind for kind in TOWARDS if " " not in kind]
+    if word and word not in {name.split()[0] for name in MOTIONS} and not did_you_mean(word, MOTIONS):
+        if word in kinds:
+            raise UserError(f"{where}: name a body of the world after {word}")
+        if meant := did_you_mean(word, kinds):
+            raise UserError(f"{where}: unknown motion {word!r}{meant}")
+    return None
 
 
-def _with_target(kind: str, base: MotionRequest, target: np.ndarray, touching: float, height: float) -> MotionRequest:
-    """Return the request for the motion of ``kind`` towards a body ``target`` (2,) m ahead and to the left."""
-    distance = float(np.linalg.norm(target))
-    if kind == "face":
-        values = {"heading_degrees": float(np.degrees(np.arctan2(target[1], target[0])))}
-    elif kind == "jump to":
-        values = {"distance": min(distance / height, MAX_TARGET)}
+def _place(text: str, where: str) -> np.ndarray:
+    """Parse the target ``to X,Y`` of a push."""
+    number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
+    match = re.fullmatch(rf"to\s+({number})(?:\s*,\s*|\s+)({number})", text.strip(), re.IGNORECASE)
+    if match is None or max(abs(float(match[1])), abs(float(match[2]))) > _MAX_PLACE:
+        raise UserError(f"{where}: give a position in the world in metres, as in push box to 1,0.5")
+    return np.array([float(match[1]), float(match[2])])
+
+
+def _values(kind: str, parameters: tuple[Value, ...], words: list[str], where: str) -> dict[str, float]:
+    """Parse the numbers of a motion, in order or by name."""
+    known = {value.name: value for value in parameters}
+    given: dict[str, float] = {}
+    for word in words:
+        if re.fullmatch(r"[xX]\d+", word):
+            raise UserError(f"{where}: it cannot be repeated; write it once more")
+        key, equals, number = word.partition("=")
+        free = [name for name in known if name not in given]
+        key, number = (key, number) if equals else (free[0] if free else "", word)
+        if key not in known or key in given:
+            names = " and ".join(known)
+            raise UserError(f"{where}: {word!r}{did_you_mean(key, known)}: {kind} takes the numbers {names}")
+        given[key] = known[key].parse(number, where)
+    return {name: given.get(name, value.default) for name, value in known.items()}
+
+
+def _time_limit(piece: _Piece, other: OtherBody, stance: Stance) -> float:
+    """Return the time limit of a motion in seconds, for a body of 1 m."""
+    centre = other.centre(stance)
+    if piece.kind in ("follow", "avoid"):
+        return piece.values["seconds"] + 5.0
+    if piece.kind in ("jump to", "kick"):
+        (base,) = script("jump").requests
+    elif piece.kind == "face":
+        angle = float(np.degrees(np.arctan2(centre[1], centre[0])))
+        (base,) = script(f"turn {angle:.6f}").requests
     else:
-        left = max(distance - touching - _CLEARANCE * height, 0.0) / max(distance, 1e-9)
-        ahead, aside = np.clip(left * target / height, -MAX_TARGET, MAX_TARGET).tolist()
-        values = {"ahead": ahead, "left": aside}
-    return replace(base, asked={**base.asked, **values}, layers=())
+        length = float(np.linalg.norm(centre))
+        if piece.place is not None:
+            length += float(np.linalg.norm(_in_frame(piece.place, stance) - centre))
+        return _walk_limit(length / stance.body.height)
+    return _TIME_FACTOR * frames_of_request(base) / 60.0
 
 
-def _begin(kind: str, base: MotionRequest, other: OtherBody, asked: dict[str, float], stance: Stance) -> BodyMotion:
-    """Begin the motion of ``kind`` towards ``other`` and store its target in ``asked``, by which the result is
-    judged. A jump has no such target, because the other body may stop it."""
-    target, touching = other.place(stance)
-    height = stance.body.height
-    request = _with_target(kind, base, target, touching, height)
-    if kind == "jump to":
-        direction = target @ stance.ground.axes[:2]
-        stance = stance.with_forward(direction / np.linalg.norm(direction))
-    elif kind == "face":
-        asked["heading_degrees"] = request.asked["heading_degrees"]
+def _walk_limit(length: float) -> float:
+    """Return the time limit of a steered walk of ``length`` body heights in seconds, for a body of 1 m."""
+    return _EXTRA_TIME + length / (_MIN_SPEED * GRAVITY**0.5)
+
+
+def _in_frame(place: np.ndarray, stance: Stance) -> np.ndarray:
+    """Transform a point (2,) m on the ground of the world to the ground frame of ``stance``."""
+    return stance.ground.local(np.array([*place, 0.0]))[:2]
+
+
+def _among(
+    requests: tuple[MotionRequest, ...], others: Mapping[str, OtherBody], stance: Stance
+) -> tuple[MotionRequest, ...]:
+    """Return the requests of a creature among ``others``: a walk to a point is steered round them."""
+    if not others:
+        return requests
+    return tuple(
+        replace(
+            request,
+            begin=partial(_begin_walk, request, others),
+            seconds=_walk_limit(float(np.hypot(request.asked["ahead"], request.asked["left"]))),
+        )
+        if request.name == "walk to" and not request.layers
+        else request
+        for request in requests
+    )
+
+
+def _begin_walk(request: MotionRequest, others: Mapping[str, OtherBody], stance: Stance) -> BodyMotion:
+    """Begin a walk to a point, given in body heights ahead and to the left."""
+    point = stance.body.height * np.array([request.asked["ahead"], request.asked["left"]])
+    return _steered(WalkToPoint(stance, point), others, stance, "walk to", goal=point)
+
+
+def _begin(piece: _Piece, others: Mapping[str, OtherBody], asked: dict[str, float], stance: Stance) -> BodyMotion:
+    """Begin a motion towards a body and store its target in ``asked``, by which the result is judged. A jump has no
+    such target, because the other body may stop it."""
+    other, values = others[piece.name], piece.values
+    height, name = stance.body.height, piece.name
+    centre, _ = other.place(stance)
+    if piece.kind == "face":
+        asked["heading_degrees"] = float(np.degrees(np.arctan2(centre[1], centre[0])))
         if abs(np.radians(asked["heading_degrees"])) < _MIN_TURN:
             return StandFor(stance, _NO_TURN_TIME)
-    else:
-        asked["distance"] = float(np.hypot(request.asked["ahead"], request.asked["left"]))
-    (task,) = tasks_of_request(request, height)
+        return _of_registry("turn", {**asked, **values}, stance)
+    if piece.kind == "jump to":
+        distance = float(np.linalg.norm(centre))
+        forward = stance.with_forward(centre @ stance.ground.axes[:2] / distance)
+        return _of_registry("jump", {"distance": min(distance / height, MAX_TARGET), **values}, forward)
+    if piece.kind == "kick":
+        return Kick(stance, other, name, JumpTarget(values["distance"] * height, values["height"] * height))
+    if piece.kind == "push":
+        assert piece.place is not None
+        place = _in_frame(piece.place, stance)
+        return _steered(PushTo(stance, other, name, place), others, stance, f"push {name}")
+    gap = values["gap"] * height
+    if piece.kind == "follow":
+        return _steered(FollowBody(stance, other, name, gap, values["seconds"]), others, stance, f"follow {name}")
+    if piece.kind == "avoid":
+        return _steered(AvoidBody(stance, other, name, gap, values["seconds"]), others, stance, f"avoid {name}")
+    return _steered(WalkToBody(stance, other, name, gap), others, stance, f"{piece.kind} {name}")
+
+
+def _of_registry(name: str, values: Mapping[str, float], stance: Stance) -> BodyMotion:
+    """Begin a motion of the registry."""
+    (base,) = script(name).requests
+    (task,) = tasks_of_request(replace(base, asked={**base.asked, **values}), stance.body.height)
     return task.begin(stance)
+
+
+def _steered(
+    policy: Policy, others: Mapping[str, OtherBody], stance: Stance, what: str, *, goal: np.ndarray | None = None
+) -> Steered:
+    """Return a steered walk. Raises ``UserError`` if its ``goal`` (2,) m is in an obstacle or in a body."""
+    height = stance.body.height
+    if goal is not None:
+        where = f"{goal[0] / height:.2f} ahead and {goal[1] / height:.2f} to the left"
+        if is_blocked(stance, goal, radius_of(stance.ground.local(stance.standing))):
+            raise UserError(f"{what}: there is an obstacle at the target, {where}; give a target beside it")
+        # Only props stay where they are.
+        for name, other in others.items():
+            centre, touching = other.place(stance)
+            if other.body.mesh.tets.shape[0] == 1 and np.linalg.norm(centre - goal) < touching:
+                raise UserError(f"{what}: {name} is at the target, {where}; give a target beside it")
+    expected = 10.0 * stance.body.time_unit
+    return Steered(stance, others, policy, expected_time=expected)

@@ -10,7 +10,7 @@ from egs_warp.locomotion.trajectory import MotionOutcome
 from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.fall_monitor import tips_body
 from egs_warp.motions.feet import SupportKind
-from egs_warp.motions.sequence import MotionRecord
+from egs_warp.motions.sequence import JudgedOutcome, MotionRecord
 
 MAX_END_TILT = 30.0
 """Tilt at the end of a motion above which the body is considered fallen, degrees."""
@@ -87,6 +87,8 @@ class EndCause:
             missed = ["not at rest within the time limit of the motion"]
         if isinstance(also_reached, ActOutcome):
             missed += [gesture.text for gesture in also_reached.gestures if gesture.is_missed]
+        if isinstance(also_reached, JudgedOutcome) and entry.motion.is_at_rest:
+            missed += also_reached.failures
         slip = getattr(also_reached, "slip", 0.0)
         if self.base is SupportKind.FEET and slip > MAX_SLIP:
             missed.append(f"feet slide by {100.0 * slip:.0f} % of a stride")

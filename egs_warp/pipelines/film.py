@@ -17,7 +17,7 @@ from egs_warp.deformation.splitting import split_for_motion
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_camera
-from egs_warp.geometry.gaussians import GaussianCloud, hidden_below, most_visible
+from egs_warp.geometry.gaussians import GaussianCloud, cut_at, hidden_below, most_visible
 from egs_warp.geometry.main_light import MainLight
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.io.video import VideoWriter, contact_sheet, write_png
@@ -204,15 +204,28 @@ def split_deformer(performance: BodyResult, *, in_scene: bool = False) -> Deform
     """
     body, simulation = performance.body, performance.simulation
     trajectory, cloud, mesh = simulation.trajectory, body.cloud, body.mesh
-    if not in_scene and trajectory.ground_coefficients.size == 0:
-        # Hide the haze of the captured ground, which would be visible below a jumping creature.
-        cloud = hidden_below(cloud, GROUND, margin=_BELOW_GROUND * trajectory.height)
+    hides_ground = not in_scene and trajectory.ground_coefficients.size == 0
+    if hides_ground:
+        cloud = above_ground(cloud, trajectory.height)
     if len(mesh.tets) == 1:
         return Deformer(cloud, embed_gaussians(cloud, mesh))
     keys = simulation.frames[:: max(1, len(simulation.frames) // SPLIT_KEY_FRAMES)]
-    embedding = embed_gaussians(body.cloud, mesh)
+    embedding = embed_gaussians(cloud, mesh)
     split = split_for_motion(cloud, embedding, [trajectory.positions[step] for step in keys])
-    return Deformer(split.cloud, split.embedding)
+    parts = below_ground_hidden(split.cloud, trajectory.height) if hides_ground else split.cloud
+    return Deformer(parts, split.embedding)
+
+
+def above_ground(cloud: GaussianCloud, height: float) -> GaussianCloud:
+    """Return ``cloud`` without the haze of the captured ground, and cut at the ground: both would be visible below a
+    jumping creature of this ``height`` (m)."""
+    return cut_at(below_ground_hidden(cloud, height), GROUND)
+
+
+def below_ground_hidden(cloud: GaussianCloud, height: float) -> GaussianCloud:
+    """Return ``cloud`` with the Gaussians below the ground of a creature of this ``height`` (m) made transparent; the
+    parts of split Gaussians may be there."""
+    return hidden_below(cloud, GROUND, margin=_BELOW_GROUND * height)
 
 
 def drawn_frames(

@@ -131,10 +131,12 @@ class BodyInfo:
             f"muscles  {self.muscles.fibre_count} fibres, {self.muscles.segment_count} segments"
             f" ({', '.join(f'{count} {kind.value}' for kind, count in kinds.items())})"
         )
-        for name, why in self.motions().items():
+        motions = self.motions()
+        width = max(map(len, motions))
+        for name, why in motions.items():
             needs = MOTIONS[name].file
             can = f"yes, with {needs}" if needs is not None else "yes"
-            lines.append(f"{name:<10} {can if why is None else f'no: {why}'}")
+            lines.append(f"{name:<{width}} {can if why is None else f'no: {why}'}")
         return [*lines, *(f"note: {note}" for note in self.notes)]
 
     def _kinds(self) -> dict[FibreKind, int]:

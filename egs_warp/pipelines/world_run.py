@@ -18,12 +18,13 @@ from egs_warp.locomotion.rollout import FRAME_RATE, BodyRun, RolloutResult
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import FIRST_PART, Trajectory
 from egs_warp.locomotion.world_rollout import roll_out_world, world_steps
+from egs_warp.motions.other_body import OtherBody
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.sequence import MotionRecord
 from egs_warp.motions.stance import RestDetector
 from egs_warp.motions.style import Style
-from egs_warp.motions.towards import OtherBody, script_among
+from egs_warp.motions.towards import script_among
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.end_state import EndCause
 from egs_warp.pipelines.finished_run import PARTS
@@ -163,7 +164,9 @@ def simulate_world(
     def others(name: str) -> dict[str, OtherBody]:
         """Return the bodies other than the creature ``name``, with their current states."""
         return {
-            member.name: OtherBody(member.body.body, partial(_state_of, member, runs, index[member.name]))
+            member.name: OtherBody(
+                member.body.body, partial(_state_of, member, runs, index[member.name]), member.body.geometry
+            )
             for member in world.members
             if member.name != name
         }
@@ -200,6 +203,7 @@ def simulate_world(
                     place=body.frame,
                     front=front,
                     kicks=kicks,
+                    has_others=len(world.members) > 1,
                     parts=parts_of(name),
                     resume=recorded(name),
                 )

@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.render.backward import pose_backward_kernel, project_backward_kernel
+from egs_warp.kernels.render.backward_cpu import project_backward_block_kernel
 from egs_warp.kernels.render.compositing import composite_backward_block_kernel, composite_backward_tile_kernel
 from egs_warp.kernels.render.ellipse import TILE_PIXELS
 from egs_warp.kernels.render.pixel_gradients import pixel_gradients_kernel
+from egs_warp.kernels.render.projection_cpu import BLOCK
 from egs_warp.launching import empty, empty_pooled, grow_capacity, launch_cached, launch_rows
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.projection import ProjectedGaussians
@@ -88,21 +91,21 @@ def backward(
             device=device,
         )
     else:
-        pixel_count = int(view.width) * int(view.height)
-        sum_gradient = empty(pixel_count, wp.vec4, device)
-        remaining = empty(pixel_count, wp.float32, device)
+        width, height = int(view.width), int(view.height)
+        sum_gradient, remaining = empty_pooled(device, ((height, width), wp.vec4), ((height, width), wp.float32))
         launch_rows(
             pixel_gradients_kernel,
-            pixel_count,
+            height,
             inputs=pixels,
             outputs=[sum_gradient, remaining],
             device=device,
             threads=threads,
+            work=np.ones(height),
         )
         launch_rows(
             composite_backward_tile_kernel,
             lists.tile_count,
-            inputs=[*tile_inputs, sum_gradient, remaining],
+            inputs=[*tile_inputs, sum_gradient.flatten(), remaining.flatten()],
             outputs=[moments],
             device=device,
             threads=threads,
@@ -122,15 +125,20 @@ def backward(
         pose_rotation=empty(count, wp.mat33, device) if want_pose else None,
         pose_translation=empty(count, wp.vec3, device) if want_pose else None,
     )
-    by_gaussian = {"device": device, "threads": threads}
     gradient_inputs = [projected.slot_end, moments]
     pose_inputs = [cloud.means, cloud.rotations, cloud.log_scales]
+    kernel, rows, work = project_backward_kernel, count, None
+    if device.is_cpu:
+        kernel, rows = project_backward_block_kernel, -(-count // int(BLOCK))
+        work = np.ones(rows)
     launch_rows(
-        project_backward_kernel,
-        count,
+        kernel,
+        rows,
         inputs=[view, int(antialiased), *pose_inputs, cloud.opacity_logits, cloud.sh, *gradient_inputs],
         outputs=[*(gradients.means, gradients.rotations, gradients.log_scales, gradients.opacity_logits, gradients.sh)],
-        **by_gaussian,
+        device=device,
+        threads=threads,
+        work=work,
     )
     if want_pose or want_screen:
         launch_rows(
@@ -138,6 +146,7 @@ def backward(
             count,
             inputs=[view, int(antialiased), *pose_inputs, cloud.sh, *gradient_inputs],
             outputs=[gradients.screen, gradients.pose_rotation, gradients.pose_translation],
-            **by_gaussian,
+            device=device,
+            threads=threads,
         )
     return gradients

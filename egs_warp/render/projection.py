@@ -17,6 +17,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
 from egs_warp.kernels.render.projection import NOT_FINITE, View, project_kernel
+from egs_warp.kernels.render.projection_cpu import BLOCK, project_block_kernel
 from egs_warp.launching import device_of, empty, empty_pooled, launch_rows
 
 
@@ -89,13 +90,18 @@ def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int)
     ellipse, falloff, colour_depth, tile_count = empty_pooled(
         device, (count, wp.vec4), (count, wp.vec2), (count, wp.vec4), (count, wp.int64)
     )
+    kernel, rows, work = project_kernel, count, None
+    if device.is_cpu:
+        kernel, rows = project_block_kernel, -(-count // int(BLOCK))
+        work = np.ones(rows)
     launch_rows(
-        project_kernel,
-        count,
+        kernel,
+        rows,
         inputs=[view, int(antialiased), *(getattr(cloud, name) for name in ARRAYS)],
         outputs=[ellipse, falloff, colour_depth, tile_count],
         device=device,
         threads=threads,
+        work=work,
     )
     wp.utils.array_scan(tile_count, tile_count, inclusive=True)
     last = _fetch_last(tile_count)

@@ -16,7 +16,7 @@ from egs_warp.kernels.render import backdrop as kernels
 from egs_warp.launching import empty, launch_cached, launch_rows, zeros
 from egs_warp.render.projection import view_from_camera
 
-_LAYERS = ((0.0, 0.1, 0.035), (0.1, 0.35, 0.08), (0.35, 2.0, 0.16))
+_LAYERS = ((0.0, 0.06, 0.02), (0.06, 0.3, 0.065), (0.3, 2.0, 0.16))
 """Height range over the plane and blur width of each layer, relative to the body height."""
 _CAST_EDGES = (0.0, 0.2, 0.6, 6.0)
 """Bounds between the layers of the main light's shadow: heights over the plane, relative to the body height."""
@@ -75,7 +75,7 @@ class ShadowMap:
         if light is None:
             edges, blurs = np.array([layer[:2] for layer in _LAYERS]), np.array([layer[2] for layer in _LAYERS])
             # Higher layers block less of the sky, so they darken less.
-            self._max_opacity = wp.vec3(*(0.5 - 1.5 * blur for _, _, blur in _LAYERS))
+            self._max_opacity = wp.vec3(*(0.6 - 2.5 * blur for _, _, blur in _LAYERS))
         else:
             edges = np.column_stack([_CAST_EDGES[:-1], _CAST_EDGES[1:]])
             sine = max(float(light.direction @ plane.normal), _MIN_SINE)

@@ -9,11 +9,12 @@ import numpy as np
 import warp as wp
 
 from egs_warp.kernels.render.ellipse import TILE
-from egs_warp.kernels.render.tiles import (
+from egs_warp.kernels.render.tiles import emit_tiles_kernel, finish_lists_kernel
+from egs_warp.kernels.render.tiles_cpu import (
+    compact_visible_kernel,
     count_tiles_kernel,
-    emit_tiles_kernel,
     fill_tiles_kernel,
-    finish_lists_kernel,
+    split_ranks_kernel,
 )
 from egs_warp.launching import device_of, empty, empty_pooled, grow_capacity, launch_cached, launch_rows, zeros
 from egs_warp.render.projection import ProjectedGaussians
@@ -70,32 +71,38 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
     """Build the lists by a counting sort over chunks of the depth order, in parallel and without comparing pairs."""
     device = device_of(projected.ellipse)
     pairs = projected.slot_count
-    slot_counts = np.diff(projected.slot_end.numpy(), prepend=0)
-    gaussian_from_visible = np.flatnonzero(slot_counts).astype(np.int32)
-    visible_count = len(gaussian_from_visible)
-    keys = empty(2 * max(visible_count, 1), wp.float32, device)
-    order = empty(2 * max(visible_count, 1), wp.int32, device)
-    keys.numpy()[:visible_count] = projected.colour_depth.numpy()[gaussian_from_visible, 3]
-    by_depth: np.ndarray = order.numpy()
-    by_depth[:visible_count] = gaussian_from_visible
+    count = projected.slot_end.shape[0]
+    # The sort needs twice the space of its data.
+    keys, order, visible = empty_pooled(device, (2 * count, wp.float32), (2 * count, wp.int32), (1, wp.int32))
+    launch_cached(
+        compact_visible_kernel,
+        1,
+        inputs=[projected.slot_end, projected.colour_depth],
+        outputs=[keys, order, visible],
+        device=device,
+    )
+    visible_count = int(visible.numpy()[0])
     wp.utils.radix_sort_pairs(keys, order, visible_count)
-
-    # Near Gaussians reach more tiles than far ones, so chunks have equal numbers of pairs instead of Gaussians.
     chunks = min(8 + 4 * threads, max(1, visible_count // 256)) if threads > 1 else 1
-    # One Gaussian in eight is a sufficient sample.
-    pairs_done = np.cumsum(slot_counts[by_depth[:visible_count:8]])
-    inner = 8 * np.searchsorted(pairs_done, np.arange(1, chunks) * (pairs_done[-1] / chunks)) if chunks > 1 else []
-    edges = np.concatenate([[0], inner, [visible_count]]).astype(np.int32)
-    chunk_start = wp.array(edges, dtype=wp.int32, device=device)
-    tile_from_slot, gaussians, slots = (empty(max(pairs, 1), wp.int32, device) for _ in range(3))
+    chunk_start, pair_start = empty_pooled(device, (chunks + 1, wp.int32), (chunks + 1, wp.int32))
+    launch_cached(
+        split_ranks_kernel,
+        1,
+        inputs=[visible_count, pairs, order, projected.slot_end],
+        outputs=[chunk_start, pair_start],
+        device=device,
+    )
+    capacity = grow_capacity(pairs)
+    (tile_from_pair,) = empty_pooled(device, (capacity + 4 * chunks, wp.int32))
+    gaussians, slots = empty_pooled(device, (capacity, wp.int32), (capacity, wp.int32))
     counts = zeros((chunks, tiles), wp.int32, device)
     walk = {"device": device, "threads": threads, "work": np.ones(chunks)}
-    shared = [chunk_start, order, projected.slot_end]
+    shared = [chunk_start, pair_start, order]
     launch_rows(
         count_tiles_kernel,
         chunks,
         inputs=[view.width, view.height, *shared, projected.ellipse, projected.falloff],
-        outputs=[tile_from_slot, counts],
+        outputs=[tile_from_pair, counts],
         **walk,
     )
     work = counts.numpy().sum(axis=0)
@@ -103,7 +110,13 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
     # In each tile, the entries of a chunk follow the entries of the previous chunks, which are nearer.
     cursor = counts.numpy()
     cursor[:] = np.cumsum(cursor, axis=0) - cursor + tile_start[:-1]
-    launch_rows(fill_tiles_kernel, chunks, inputs=[*shared, tile_from_slot], outputs=[counts, gaussians, slots], **walk)
+    launch_rows(
+        fill_tiles_kernel,
+        chunks,
+        inputs=[*shared, projected.slot_end, tile_from_pair],
+        outputs=[counts, gaussians, slots],
+        **walk,
+    )
     return TileLists(wp.array(tile_start, dtype=wp.int32, device=device), gaussians, slots, work)
 
 

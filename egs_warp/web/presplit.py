@@ -15,6 +15,7 @@ from egs_warp.deformation.splitting import split_for_motion
 from egs_warp.fem.body import SoftBody
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.film import above_ground, below_ground_hidden
 
 MODE_COUNT = 6
 """Number of modes for which the Gaussians are split."""
@@ -22,10 +23,17 @@ MODE_AMPLITUDE = 0.3
 """Largest nodal displacement of a mode, body heights."""
 
 
-def presplit_gaussians(creature: Creature) -> GaussianCloud:
-    """Return the Gaussians of the creature at rest, split where the softest modes bend them."""
-    embedding = embed_gaussians(creature.cloud, creature.cage.mesh)
-    return split_for_motion(creature.cloud, embedding, likely_poses(creature.body)).cloud
+def presplit_gaussians(creature: Creature, *, hides_ground: bool) -> GaussianCloud:
+    """Return the Gaussians of the creature at rest, split where the softest modes bend them.
+
+    Args:
+        creature: The creature.
+        hides_ground: True if only flat ground is drawn around it: what crosses the ground is cut at it, as in a film.
+    """
+    height = creature.body.height
+    cloud = above_ground(creature.cloud, height) if hides_ground else creature.cloud
+    split = split_for_motion(cloud, embed_gaussians(cloud, creature.cage.mesh), likely_poses(creature.body)).cloud
+    return below_ground_hidden(split, height) if hides_ground else split
 
 
 def likely_poses(body: SoftBody) -> list[np.ndarray]:

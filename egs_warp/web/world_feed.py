@@ -134,7 +134,7 @@ def live_page_bodies(world: World) -> list[PageBody]:
 def _page_body(member: PlacedBody, camera: Camera) -> PageBody:
     body = member.body
     if isinstance(body, Creature):
-        splats, feet = presplit_gaussians(body), initial_stance(body).feet()
+        splats, feet = presplit_gaussians(body, hides_ground=True), initial_stance(body).feet()
     else:
         splats, feet = body.cloud, ()
     shape = ContactShape.of(body.geometry, body.shape.level_set, body.mesh.nodes)

@@ -94,7 +94,7 @@ def test_problems_are_one_line(reader: ModuleType, run_folder: Path, tmp_path: P
     assert "none.egs: cannot be read" in problem(tmp_path / "none.egs")
     (tmp_path / "other.egs").write_bytes(b"ply\nformat ascii 1.0\n")
     assert "other.egs: cannot be read (" in problem(tmp_path / "other.egs")
-    (tmp_path / "cut.egs").write_bytes(b"EGSB\1\0\0\0\x02\0\0\0{}")
+    (tmp_path / "cut.egs").write_bytes(b"EGSB\2\0\0\0\x02\0\0\0{}")
     assert "cut.egs: cannot be read (no array 'bodies'); choose a bundle" in problem(tmp_path / "cut.egs")
     shutil.copy(run_folder / "trajectory.npz", tmp_path)
     with np.load(run_folder / "creature.npz") as data:

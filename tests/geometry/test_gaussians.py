@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
 
-from egs_warp.geometry.gaussians import GaussianCloud, hidden_below, most_visible
+from egs_warp.geometry.gaussians import GaussianCloud, cut_at, hidden_below, most_visible
 from egs_warp.geometry.plane import Plane
 
 
@@ -37,6 +39,29 @@ def test_gaussians_that_reach_far_below_a_plane_are_hidden() -> None:
     )
     hidden = hidden_below(cloud, Plane(np.eye(3)[2], 0.0), margin=0.01)
     np.testing.assert_array_equal(hidden.opacities() < 1.0 / 255.0, [False, True, True, False])
+
+
+def test_a_cut_gaussian_has_the_moments_of_its_part_above_the_plane() -> None:
+    """Compared with 400,000 samples; Gaussians away from the plane keep their bits."""
+    plane = Plane(np.array([0.0, 0.6, 0.8]), -0.1)
+    rotation = Rotation.from_rotvec([0.3, -0.8, 0.5])
+    quaternion = rotation.as_quat()[[3, 0, 1, 2]]
+    scales = np.array([0.3, 0.05, 0.12])
+    means = np.array([[0.1, 0.05, 0.2], [0.0, 0.0, 5.0], [0.0, 0.0, -5.0]])
+    cloud = GaussianCloud.from_numpy(
+        means, np.tile(quaternion, (3, 1)), np.tile(np.log(scales), (3, 1)), np.full(3, 1.0), np.zeros((3, 1, 3))
+    )
+    cut = cut_at(cloud, plane)
+    np.testing.assert_array_equal(cut.means.numpy()[1:], cloud.means.numpy()[1:])
+    np.testing.assert_array_equal(cut.opacity_logits.numpy()[1:], cloud.opacity_logits.numpy()[1:])
+    samples = means[0] + (np.random.default_rng(0).normal(size=(400_000, 3)) * scales) @ rotation.as_matrix().T
+    above = samples[plane.heights(samples) > 0.0]
+    assert 0.1 < len(above) / len(samples) < 0.9
+    np.testing.assert_allclose(cut.means.numpy()[0], above.mean(axis=0), atol=1e-3)
+    axes = Rotation.from_quat(cut.rotations.numpy()[0, [1, 2, 3, 0]]).as_matrix() * np.exp(cut.log_scales.numpy()[0])
+    np.testing.assert_allclose(axes @ axes.T, np.cov(above.T), atol=2e-4)
+    assert cut.opacities()[0] / cloud.opacities()[0] == pytest.approx(len(above) / len(samples), abs=3e-3)
+    assert cut_at(cloud, Plane(plane.normal, 2.0)) is cloud
 
 
 def test_the_most_visible_are_wide_and_opaque_and_keep_their_order() -> None:

@@ -57,7 +57,7 @@ def test_equal_content_gives_equal_bytes(tmp_path: Path) -> None:
 def test_the_parts_of_the_file_are_in_the_order_in_which_a_player_needs_them() -> None:
     block, scene = text_of(bundle_bytes())["bodies"]
     starts = [max(entry["offset"] for entry in body["arrays"].values()) for body in (block, scene)]
-    starts += [part["arrays"]["origins"]["offset"] for part in block["blocks"]]
+    starts += [part["arrays"]["residuals"]["offset"] for part in block["blocks"]]
     assert starts == sorted(starts)
 
 

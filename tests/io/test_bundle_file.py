@@ -13,6 +13,8 @@ import pytest
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.io.bundle import read_bundle, write_bundle
+from egs_warp.io.bundle_arrays import PackedArray
+from egs_warp.io.bundle_track import TrackPredictor
 from tests.support.bundles import bundle_bytes, small_bundle, text_of, with_text
 
 
@@ -31,7 +33,7 @@ def test_a_valid_bundle_is_described(tmp_path: Path, capsys: pytest.CaptureFixtu
     status, (line,) = _lines(bundle_bytes(), tmp_path, capsys)
     assert status == 0
     assert line.startswith(
-        "valid, version 1, 130 frames, 0.0 MB; block: 7 Gaussians, 8 nodes with an error of at most "
+        "valid, version 2, 130 frames, 0.0 MB; block: 7 Gaussians, 8 nodes with an error of at most "
     )
     assert line.endswith("; scene: 7 Gaussians, static")
 
@@ -41,9 +43,9 @@ def test_a_valid_bundle_is_described(tmp_path: Path, capsys: pytest.CaptureFixtu
     [
         (b"", "the file does not begin with EGSB"),
         (b"PK\3\4" + bytes(60), "the file does not begin with EGSB"),
-        (b"EGSB\2\0\0\0" + bytes(8), "version 2 of the format is not supported; this program reads version 1"),
-        (b"EGSB\1\0\0\0\xff\0\0\0{}", "the JSON text of 255 bytes is longer than the file"),
-        (b"EGSB\1\0\0\0\5\0\0\0hello", "the JSON text cannot be read"),
+        (b"EGSB\1\0\0\0" + bytes(8), "version 1 of the format is not supported; this program reads version 2"),
+        (b"EGSB\2\0\0\0\xff\0\0\0{}", "the JSON text of 255 bytes is longer than the file"),
+        (b"EGSB\2\0\0\0\5\0\0\0hello", "the JSON text cannot be read"),
         (bundle_bytes()[:-1], "the data have "),
         (bundle_bytes() + b"x", "the data have "),
     ],
@@ -99,6 +101,10 @@ def _double(entry: dict[str, Any]) -> None:
         (lambda t: _arrays(t).update(normals=_arrays(t)["means"]), "bodies/0/normals: its bytes overlap"),
         (lambda t: t["bodies"].reverse(), "the arrays are not in order: those of all bodies, then the first blocks"),
         (lambda t: t["bodies"][1].update(count=6), "bodies/1: means has shape [7, 3], not [6, 3]"),
+        (lambda t: _block(t).update(arrays={}), "bodies/0/blocks/1/arrays: 'residuals' is a required property"),
+        (lambda t: _block(t).update(frames=59), "bodies/0: blocks/1: residuals has shape [1440], not [1416]"),
+        (lambda t: _arrays(t)["weights"].update(step=[0.01]), "bodies/0: lower of weights is not -128 steps"),
+        (lambda t: t["bodies"][0].pop("node_step"), "bodies/0: 'node_step' is a dependency of 'blocks'"),
         (lambda t: _block(t).update(first=59), "bodies/0: blocks/1: begins at frame 59, not 60"),
         (lambda t: t.update(frames=131), "bodies/0: its blocks have 130 frames, but the bundle has 131"),
         (lambda t: t["bodies"][0].update(node_error=1e-3), "bodies/0: node_error 0.001 is larger than"),
@@ -123,6 +129,35 @@ def test_an_index_beyond_the_cage_is_found(name: str, tmp_path: Path, capsys: py
     write_bundle(tmp_path / "b.egs", replace(made, bodies=(replace(body, cage=replace(body.cage, **{name: values})),)))
     status, lines = _lines((tmp_path / "b.egs").read_bytes(), tmp_path, capsys)
     assert status == 2 and any(line.startswith(f"bodies/0: {name} has the index 200") for line in lines), lines
+
+
+@pytest.mark.parametrize(
+    ("name", "position", "said"),
+    [
+        ("order", 0, "order does not have each node once"),
+        ("parents", 3, "parents has a position that is not before its own"),
+        ("weights", 0, "the weights of the first position are not 0"),
+    ],
+)
+def test_a_wrong_predictor_is_found(
+    name: str,
+    position: int,
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    arrays_of = TrackPredictor.arrays
+
+    def damaged(predictor: TrackPredictor) -> dict[str, PackedArray]:
+        arrays = arrays_of(predictor)
+        arrays[name].stored[position] = 7
+        return arrays
+
+    monkeypatch.setattr(TrackPredictor, "arrays", damaged)
+    write_bundle(tmp_path / "b.egs", small_bundle())
+    status, lines = _lines((tmp_path / "b.egs").read_bytes(), tmp_path, capsys)
+    assert status == 2 and lines == [f"bodies/0: {said}"]
 
 
 def test_all_findings_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

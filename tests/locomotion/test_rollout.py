@@ -10,13 +10,15 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.implicit_step import UnsolvableStepError
-from egs_warp.locomotion.rollout import REST_FRAMES, RolloutResult, roll_out
+from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.rollout import REST_FRAMES, BodyRun, RolloutResult, roll_out
 from egs_warp.locomotion.settling import settle
-from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import box_mesh
+from tests.support.props import box_body
 from tests.support.stances import FORWARD
 
 
@@ -139,3 +141,33 @@ def test_zero_frames(creature: CoarseCreature) -> None:
     done = roll_out(creature.stepper, creature.stepper.geometry, creature.start, sequence, frames=0)
     assert not done.stopped and done.reports == () and done.frames.tolist() == [0]
     assert len(done.trajectory.time) == 1
+
+
+def test_bodies_that_push_from_the_side_are_no_support() -> None:
+    stepper = box_body((0.4, 0.4, 0.4)).stepper
+    nodes = stepper.body.mesh.nodes
+    start = BodyState(nodes, np.zeros_like(nodes))
+    seen: list[StepReport | None] = []
+
+    class Watcher:
+        def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
+            seen.append(report)
+            return []
+
+    run = BodyRun(stepper, stepper.geometry, start, Watcher(), has_others=True)
+    _, _, reports = stepper.advance(start, run.memory, [], 1.0 / 60.0)
+    contacts = reports[-1].contacts
+    assert contacts.count >= 3
+    axes, weights, faces = contacts.axes.copy(), contacts.weights.copy(), contacts.faces.copy()
+    # Contact 0 becomes a push from the side, and contact 1 a point of another body below, whose weights sum to -1.
+    faces[:2] = -1
+    axes[0] = axes[0, [1, 2, 0]]
+    weights[1] *= -1.0
+    pushed = replace(reports[-1], contacts=replace(contacts, axes=axes, weights=weights, faces=faces), min_gap=-0.1)
+    run.finish_step([pushed])
+    run.objectives(1.0 / 60.0)
+    report = seen[-1]
+    assert report is not None and report.contacts.count == contacts.count - 1
+    np.testing.assert_array_equal(report.contacts.weights, contacts.weights[1:])
+    np.testing.assert_array_equal(report.forces, reports[-1].forces[1:])
+    assert report.min_gap == reports[-1].min_gap

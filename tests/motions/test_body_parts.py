@@ -76,6 +76,21 @@ def test_arms_are_branches_from_left_to_right() -> None:
     assert min(left[:, 2].min(), right[:, 2].min()) > 0.7
 
 
+def test_a_raised_arm_is_not_the_head() -> None:
+    """The trunk ends higher and is thicker at its top than the arm, which remains a branch."""
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        (x, z), across = (c[:, 0], c[:, 2]), np.abs(c[:, 0])
+        legs = (z < 0.5) & (across > 0.1) & (across < 0.3)
+        arms = ((z > 0.8) & (z < 1.0)) | ((x > 0.6) & (z > 0.8) & (z < 1.2))
+        return legs | ((z > 0.5) & (across < 0.3)) | arms
+
+    mesh = carved((1.6, 0.2, 1.4), 0.1, keep)
+    parts = parts_of(mesh)
+    assert parts.head is None
+    assert any(mesh.nodes[branch, 0].min() > 0.2 and mesh.nodes[branch, 2].max() > 1.15 for branch in parts.branches)
+
+
 @pytest.mark.parametrize("make", [column, stool, figure])
 def test_without_a_neck_the_head_is_the_top(make: Callable[[], TetMesh]) -> None:
     stance = standing_stance(make())

@@ -239,7 +239,7 @@ def test_a_bundle_can_play_before_all_of_it_has_arrived(chromium: Any, site: str
             const text = JSON.parse(new TextDecoder().decode(
                 bytes.subarray(12, 12 + new DataView(bytes.buffer).getUint32(8, true))));
             const length = new DataView(bytes.buffer).getUint32(8, true);
-            const first = 12 + length + text.bodies[0].blocks[1].arrays.origins.offset;
+            const first = 12 + length + text.bodies[0].blocks[1].arrays.residuals.offset;
             let control;
             const stream = new ReadableStream({ start: (controller) => { control = controller; } });
             for (let k = 0; k < first; k += 97) control.enqueue(bytes.slice(k, Math.min(k + 97, first)));

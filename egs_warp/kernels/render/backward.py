@@ -12,6 +12,7 @@ from egs_warp.kernels.render.projection import (
     ScreenCovariance,
     View,
     rotation_matrix,
+    scale_of,
     screen_axes,
     screen_covariance,
 )
@@ -118,7 +119,9 @@ def camera_space_gradient(
 ) -> CameraSpaceGradient:
     """Propagate the gradient through the screen covariance and ``screen_axes``, for a Gaussian at the camera-space
     point ``p``."""
-    row_x, row_y = screen_axes(view, p, q, log_scale)
+    # Computed once, because a call of the exponential function is expensive on a CPU.
+    scale = scale_of(log_scale)
+    row_x, row_y = screen_axes(view, p, q, scale)
     covariance = screen_covariance(row_x, row_y)
     a = 0.5 * covariance.yy / covariance.determinant
     by_splat = splat_gradient(moments, first_slot, end_slot, a, 0.5 / covariance.yy, -covariance.xy / covariance.yy)
@@ -127,7 +130,6 @@ def camera_space_gradient(
     by_row_y = 2.0 * by_covariance[1] * row_y + by_covariance[2] * row_x
 
     # row_x = fx / z (right - tx forward) scale, and row_y likewise.
-    scale = wp.vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
     axes = view.rotation * rotation_matrix(q)
     right = wp.vec3(axes[0, 0], axes[0, 1], axes[0, 2])
     down = wp.vec3(axes[1, 0], axes[1, 1], axes[1, 2])

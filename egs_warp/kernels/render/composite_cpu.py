@@ -1,133 +1,146 @@
-"""C++ code of compositing on a CPU: one thread per tile, eight pixels of a row at a time.
+"""C++ code of compositing on a CPU: one thread per tile, a block of 8 x 2 pixels at a time.
 
-It uses vectors of eight floats, which Clang maps to the SIMD instructions of the processor. The half rows of a tile
-that an ellipse reaches are computed for eight rows at once. Half rows whose pixels are all opaque are skipped.
+The blocks of a tile that an ellipse reaches are computed for all its rows at once. Blocks whose pixels are all opaque
+are skipped. ``vector_math`` defines the vector types.
 """
 
 from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
 
-_SHARED = f"""
-    #pragma clang fp contract(fast){CUTOFFS_IN_CPP}"""
-_SHARED += """
-    typedef float f8 __attribute__((ext_vector_type(8)));
-    typedef int i8 __attribute__((ext_vector_type(8)));
-    typedef bool b8 __attribute__((ext_vector_type(8)));
-    constexpr float LOG2_E = 1.4426950408889634f;
+_SHARED = (
+    CUTOFFS_IN_CPP
+    + """
     // The run-time compiler reloads literal constants at every use; reading them from memory once avoids that.
-    volatile float pool[] = {-100.0f, 1.32764720e-3f, 9.67554133e-3f, 5.55071327e-2f, 2.40221197e-1f, 6.93146967e-1f,
-                             LIMIT, CUT, STOP, 0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f};
-    const f8 least = pool[0], p5 = pool[1], p4 = pool[2], p3 = pool[3], p2 = pool[4], p1 = pool[5];
-    const f8 limit = pool[6], cut = pool[7], stopped = pool[8], none = pool[9], one = pool[10];
-    const f8 steps = {pool[9], pool[10], pool[11], pool[12], pool[13], pool[14], pool[15], pool[16]};
-    // 2^x for x <= 0 to 8e-8: 2^whole times the polynomial nearest to 2^part, part in [-1/2, 1/2].
-    auto power_of_two = [&](f8 x) -> f8 {
-        #pragma clang fp contract(fast)
-        const f8 t = x > least ? x : least;
-        const f8 whole = __builtin_elementwise_roundeven(t);
-        const f8 part = t - whole;
-        const f8 p = ((((p5 * part + p4) * part + p3) * part + p2) * part + p1) * part + one;
-        i8 bits;
-        __builtin_memcpy(&bits, &p, 32);
-        bits += __builtin_convertvector(whole, i8) << 23;
-        f8 power;
-        __builtin_memcpy(&power, &bits, 32);
-        return power;
-    };
-    auto bits_of = [](i8 mask) -> unsigned {
-        const b8 set = __builtin_convertvector(mask, b8);
-        unsigned char bits;
-        __builtin_memcpy(&bits, &set, 1);
-        return bits;
-    };
-    // Half rows are numbered down the left half, then down the right one; pixels by half rows. A set bit of open: the
-    // half row is not yet opaque.
+    volatile float pool[] = {-LOG2_255, LIMIT, STOP, 0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f};
+    const f16 faintest = pool[0], limit = pool[1], stopped = pool[2], none = pool[3], one = pool[4];
+    // Column and row of each pixel in its block. For the rows of a tile, even ones come first, so that the two rows of
+    // block k are in places k and k + 8.
+    const f16 columns = {pool[3], pool[4], pool[5], pool[6], pool[7], pool[8], pool[9], pool[10],
+                         pool[3], pool[4], pool[5], pool[6], pool[7], pool[8], pool[9], pool[10]};
+    f16 rows = one;
+    rows.lo = none.lo;
+    const f16 tile_rows = columns * pool[5] + rows;
+    // Position of each block.
+    alignas(64) float across[16], down[16];
+    for (int block = 0; block < 16; ++block) {
+        across[block] = (float)(block & 8);
+        down[block] = (float)(2 * (block & 7));
+    }
+    // Blocks are numbered down the left half of the tile, then down the right one; pixels by blocks. A set bit of open:
+    // the block is not yet opaque.
     const int tile_width = width - left < 16 ? width - left : 16;
     const int tile_height = height - top < 16 ? height - top : 16;
-    const unsigned inside_rows = 0xFFFFu >> (16 - tile_height);
-    unsigned open = inside_rows | (tile_width > 8 ? inside_rows << 16 : 0u);
+    const unsigned inside_rows = 0xFFu >> (8 - (tile_height + 1) / 2);
+    unsigned open = tile_width > 0 ? inside_rows | (tile_width > 8 ? inside_rows << 8 : 0u) : 0u;
+    auto refresh_open = [&](const float* passing, int stride) {
+        for (unsigned to_do = open; to_do != 0; to_do &= to_do - 1) {
+            const int block = __builtin_ctz(to_do);
+            if (bits_of(*(const f16*)(passing + stride * block) > none) == 0) open &= ~(1u << block);
+        }
+    };
     auto column_of = [](int i) -> int { return (i >> 7) * 8 + (i & 7); };
     auto row_of = [](int i) -> int { return (i >> 3) & 15; };
+    struct Splat {
+        float x, y, shear, peak, steep_x, steep_y;
+        unsigned blocks;
+        wp::vec4 colour_depth;
+    };
+    constexpr int BATCH = 16;
+    Splat batch[BATCH];
 """
+)
 
-_EACH_HALF = """
-        if (i + 8 < end) {
-            const int next_id = gaussians.data[i + 8];
-            __builtin_prefetch(ellipse.data + next_id);
-            __builtin_prefetch(falloff.data + next_id);
-            __builtin_prefetch(colour_depth.data + next_id);
+_EACH_BLOCK = """
+        for (int k = 0; k < count; ++k) {
+            // The number of blocks of a splat cannot be predicted: it is computed well before it is used.
+            const int id = gaussians.data[begin + k];
+            if (begin + k + BATCH < end) {
+                const int next_id = gaussians.data[begin + k + BATCH];
+                __builtin_prefetch(ellipse.data + next_id);
+                __builtin_prefetch(falloff.data + next_id);
+                __builtin_prefetch(colour_depth.data + next_id);
+                ALSO_PREFETCH
+            }
+            const wp::vec4 e = ellipse.data[id];
+            const wp::vec2 f = falloff.data[id];
+            const float x = e[0] - (float)left - 0.5f, y = e[1] - (float)top - 0.5f;
+            const f16 dy = tile_rows - y;
+            const f16 margin = f[1] + LOG_255 - f[0] * dy * dy;
+            const f16 reach = __builtin_elementwise_sqrt((margin > none ? margin : none) * (1.0f / e[2])) + 1.0e-3f;
+            const f16 middle = x - e[3] * dy;
+            const f16 first = middle - reach, last = middle + reach;
+            const i16 inside = margin > -1.0e-3f;
+            const unsigned left_rows = bits_of(inside & (first <= 7.0f) & (last >= none));
+            const unsigned right_rows = bits_of(inside & (first <= 15.0f) & (last >= 8.0f));
+            const unsigned blocks = ((left_rows | left_rows >> 8) & 0xFFu) | ((right_rows << 8 | right_rows) & 0xFF00u);
+            // log2 of alpha is peak - steep_y dy^2 - steep_x u^2.
+            batch[k] = {x, y, e[3], f[1] * LOG2_E, e[2] * LOG2_E, f[0] * LOG2_E, blocks & open, colour_depth.data[id]};
         }
-        const wp::vec4 e = ellipse.data[id];
-        const wp::vec2 f = falloff.data[id];
-        const wp::vec4 c = colour_depth.data[id];
-        const float x = e[0] - (float)left - 0.5f, y = e[1] - (float)top - 0.5f;
-        const float steep = e[2] * LOG2_E, over_a = 1.0f / e[2];
-        // begins: start of each half row relative to the ellipse's centre there. tops: log2 of alpha there, per row.
-        alignas(32) float begins[32], tops[16], down[16];
-        unsigned reached = 0;
-        for (int rows = 0; rows < 16; rows += 8) {
-            const f8 dy = steps + ((float)rows - y);
-            const f8 at_row = f[1] - f[0] * dy * dy;
-            const f8 margin = at_row + LOG_255;
-            const f8 reach = __builtin_elementwise_sqrt((margin > none ? margin : none) * over_a) + 1.0e-3f;
-            const f8 middle = x - e[3] * dy;
-            const f8 first = middle - reach, last = middle + reach;
-            const i8 level = margin > -1.0e-3f;
-            reached |= bits_of(level & (first <= 7.0f) & (last >= none)) << rows;
-            reached |= bits_of(level & (first <= 15.0f) & (last >= 8.0f)) << (16 + rows);
-            *(f8*)(begins + rows) = -middle;
-            *(f8*)(begins + 16 + rows) = 8.0f - middle;
-            *(f8*)(tops + rows) = at_row * LOG2_E;
-            *(f8*)(down + rows) = dy;
-        }
-        for (unsigned to_do = reached & open; to_do != 0; to_do &= to_do - 1) {
-            const int half = __builtin_ctz(to_do), at = 8 * half;
-            const f8 u = steps + begins[half];
-            const f8 raw = power_of_two(tops[half & 15] - steep * u * u);
-            const f8 alpha = raw < limit ? raw : limit;
-            const f8 before = *(f8*)(passing + at);
-            const f8 after = before * (one - alpha);
-            const i8 hit = (alpha >= cut) & (before > none)ALSO_NEAR;
-            const i8 stop = hit & (after <= stopped);
+        for (int k = 0; k < count; ++k) {
+            const wp::vec4 c = batch[k].colour_depth;
+            const float shear = batch[k].shear, peak = batch[k].peak;
+            const float steep_x = batch[k].steep_x, steep_y = batch[k].steep_y;
+            const f16 near_x = columns - batch[k].x, near_y = rows - batch[k].y;
+            BEFORE_BLOCKS
+            for (unsigned to_do = batch[k].blocks; to_do != 0; to_do &= to_do - 1) {
+                const int block = __builtin_ctz(to_do);
+                f16* const channels = (f16*)pixels + CHANNELS * block;
+                const f16 dy = near_y + down[block];
+                const f16 u = near_x + across[block] + shear * dy;
+                const f16 level = peak - steep_y * dy * dy - steep_x * u * u;
+                // Undefined where the level is below the faintest.
+                const f16 whole = __builtin_elementwise_roundeven(level);
+                const f16 raw = power_of_two(whole, level - whole);
+                const f16 before = channels[PASSING];
+                const f16 alpha = (level >= faintest)ALSO_NEAR ? (raw < limit ? raw : limit) : none;
+                const f16 after = before - before * alpha;
+                const i16 stop = after <= stopped;
+                const f16 weight = stop ? none : before * alpha;
 """
 
 FORWARD = (
     _SHARED
     + """
     // Transmittance; zero outside the image, negative once a pixel is opaque.
-    alignas(64) float passing[256], red[256], green[256], blue[256], far[256], bound[256];
+    enum { PASSING, RED, GREEN, BLUE, FAR, BOUND, CHANNELS };
+    alignas(64) float pixels[16 * CHANNELS * 16];
     for (int i = 0; i < 256; ++i) {
         const bool inside = column_of(i) < tile_width && row_of(i) < tile_height;
-        passing[i] = inside ? 1.0f : 0.0f;
-        red[i] = green[i] = blue[i] = far[i] = 0.0f;
+        float* const pixel = pixels + (i >> 4) * 16 * CHANNELS + (i & 15);
+        pixel[16 * PASSING] = inside ? 1.0f : 0.0f;
+        for (int channel = RED; channel <= FAR; ++channel) pixel[16 * channel] = 0.0f;
         const bool bounded = inside && max_depth.shape[0] > 0;
         const float floor = bounded ? max_depth.data[(top + row_of(i)) * width + left + column_of(i)] : 0.0f;
-        bound[i] = floor > 0.0f ? floor : 3.0e38f;
+        pixel[16 * BOUND] = floor > 0.0f ? floor : 3.0e38f;
     }
-    for (int i = start; i < end && open != 0; ++i) {
-        const int id = gaussians.data[i];
+    for (int begin = start; begin < end && open != 0; begin += BATCH, refresh_open(pixels, 16 * CHANNELS)) {
+        const int count = end - begin < BATCH ? end - begin : BATCH;
 """
-    + _EACH_HALF.replace("ALSO_NEAR", " & (c[3] <= *(f8*)(bound + at))")
+    + _EACH_BLOCK.replace("ALSO_NEAR", " & (c[3] <= channels[BOUND])")
+    .replace("BEFORE_BLOCKS", "")
+    .replace("ALSO_PREFETCH", "")
     + """
-            const f8 weight = (hit & ~stop) ? before * alpha : none;
-            const f8 left_over = stop ? -before : (hit ? after : before);
-            *(f8*)(passing + at) = left_over;
-            *(f8*)(red + at) += weight * c[0];
-            *(f8*)(green + at) += weight * c[1];
-            *(f8*)(blue + at) += weight * c[2];
-            *(f8*)(far + at) += weight * c[3];
-            if (__builtin_reduce_or(stop) && !__builtin_reduce_or(left_over > none)) open &= ~(1u << half);
+                channels[PASSING] = stop ? -__builtin_elementwise_abs(before) : after;
+                channels[RED] += weight * c[0];
+                channels[GREEN] += weight * c[1];
+                channels[BLUE] += weight * c[2];
+                channels[FAR] += weight * c[3];
+            }
         }
     }
     for (int row = 0; row < tile_height; ++row)
         for (int column = 0; column < tile_width; ++column) {
             const int i = (column >> 3) * 128 + row * 8 + (column & 7), pixel = (top + row) * width + left + column;
-            const float through = passing[i] < 0.0f ? -passing[i] : passing[i];
+            const float* const from = pixels + (i >> 4) * 16 * CHANNELS + (i & 15);
+            const float signed_through = from[16 * PASSING];
+            const float through = signed_through < 0.0f ? -signed_through : signed_through;
             const wp::vec3 behind = background.shape[0] > 0 ? background.data[pixel] : flat_background;
             colour.data[pixel] = wp::vec3(
-                red[i] + through * behind[0], green[i] + through * behind[1], blue[i] + through * behind[2]
+                from[16 * RED] + through * behind[0],
+                from[16 * GREEN] + through * behind[1],
+                from[16 * BLUE] + through * behind[2]
             );
             alpha_out.data[pixel] = 1.0f - through;
-            depth.data[pixel] = through < 1.0f ? far[i] / (1.0f - through) : 0.0f;
+            depth.data[pixel] = through < 1.0f ? from[16 * FAR] / (1.0f - through) : 0.0f;
         }
 """
 )
@@ -135,60 +148,78 @@ FORWARD = (
 BACKWARD = (
     _SHARED
     + """
-    alignas(64) float passing[256], rest[256], by_red[256], by_green[256], by_blue[256], by_far[256];
+    enum { PASSING, REST, RED, GREEN, BLUE, FAR, CHANNELS };
+    alignas(64) float pixels[16 * CHANNELS * 16];
     for (int i = 0; i < 256; ++i) {
         const bool inside = column_of(i) < tile_width && row_of(i) < tile_height;
         const int pixel = inside ? (top + row_of(i)) * width + left + column_of(i) : 0;
         const wp::vec4 g = sum_gradient.data[pixel];
-        passing[i] = inside ? 1.0f : 0.0f;
-        rest[i] = remaining.data[pixel];
-        by_red[i] = g[0];
-        by_green[i] = g[1];
-        by_blue[i] = g[2];
-        by_far[i] = g[3];
+        float* const to = pixels + (i >> 4) * 16 * CHANNELS + (i & 15);
+        to[16 * PASSING] = inside ? 1.0f : 0.0f;
+        to[16 * REST] = remaining.data[pixel];
+        for (int k = 0; k < 4; ++k) to[16 * (RED + k)] = g[k];
     }
-    for (int i = start; i < end; ++i) {
-        float* out = (float*)moments.data + 12 * (size_t)slots.data[i];
-        if (open == 0) {
-            for (int q = 0; q < 12; ++q) out[q] = 0.0f;
-            continue;
-        }
-        const int id = gaussians.data[i];
-        f8 sums[10] = {};
+    // Partial sums: places 0 and 1 sum to the sum of a, 2 and 3 to c, 4 and 5 to b, 6 and 7 to d.
+    auto sums_of_four = [](f8 a, f8 b, f8 c, f8 d) -> f8 {
+        const f8 p = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11)
+            + __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
+        const f8 q = __builtin_shufflevector(c, d, 0, 1, 2, 3, 8, 9, 10, 11)
+            + __builtin_shufflevector(c, d, 4, 5, 6, 7, 12, 13, 14, 15);
+        return __builtin_shufflevector(p, q, 0, 1, 8, 9, 4, 5, 12, 13)
+            + __builtin_shufflevector(p, q, 2, 3, 10, 11, 6, 7, 14, 15);
+    };
+    auto out_of = [&](int i) -> float* { return (float*)moments.data + 12 * (size_t)slots.data[i]; };
+    int begin = start;
+    for (; begin < end && open != 0; begin += BATCH, refresh_open(pixels, 16 * CHANNELS)) {
+        const int count = end - begin < BATCH ? end - begin : BATCH;
 """
-    + _EACH_HALF.replace("ALSO_NEAR", "")
+    + _EACH_BLOCK.replace("ALSO_NEAR", "")
+    .replace("BEFORE_BLOCKS", "f16 sums[10] = {};")
+    .replace(
+        "ALSO_PREFETCH",
+        """const float* const next_out = out_of(begin + k + BATCH);
+                __builtin_prefetch(next_out, 1);
+                __builtin_prefetch(next_out + 11, 1);""",
+    )
     + """
-            const i8 blended = hit & ~stop;
-            const f8 weight = blended ? before * alpha : none;
-            const f8 left_over = stop ? none : (hit ? after : before);
-            *(f8*)(passing + at) = left_over;
-            const f8 red = *(f8*)(by_red + at), green = *(f8*)(by_green + at), blue = *(f8*)(by_blue + at);
-            const f8 far = *(f8*)(by_far + at);
-            const f8 value = c[0] * red + c[1] * green + c[2] * blue + c[3] * far;
-            const f8 behind = *(f8*)(rest + at) - weight * value;
-            *(f8*)(rest + at) = behind;
-            const f8 free = alpha * (before * value - behind / (one - alpha));
-            const f8 slope = (blended & (raw <= limit)) ? free : none;
-            const f8 moment = slope * u;
-            const float dy = down[half & 15];
-            sums[0] += slope;
-            sums[1] += moment;
-            sums[2] += slope * dy;
-            sums[3] += moment * u;
-            sums[4] += moment * dy;
-            sums[5] += slope * dy * dy;
-            sums[6] += weight * far;
-            sums[7] += weight * red;
-            sums[8] += weight * green;
-            sums[9] += weight * blue;
-            if (__builtin_reduce_or(stop) && !__builtin_reduce_or(left_over > none)) open &= ~(1u << half);
+                channels[PASSING] = stop ? none : after;
+                const f16 red = channels[RED], green = channels[GREEN], blue = channels[BLUE];
+                const f16 far = channels[FAR];
+                const f16 value = c[0] * red + c[1] * green + c[2] * blue + c[3] * far;
+                const f16 behind = channels[REST] - weight * value;
+                channels[REST] = behind;
+                const f16 free = alpha * (before * value - behind / (one - alpha));
+                const f16 slope = ((weight > none) & (raw <= limit)) ? free : none;
+                const f16 moment = slope * u, moment_y = slope * dy;
+                sums[0] += slope;
+                sums[1] += moment;
+                sums[2] += moment_y;
+                sums[3] += moment * u;
+                sums[4] += moment * dy;
+                sums[5] += moment_y * dy;
+                sums[6] += weight * far;
+                sums[7] += weight * red;
+                sums[8] += weight * green;
+                sums[9] += weight * blue;
+            }
+            float* out = out_of(begin + k);
+            f8 eight[12] = {};
+            for (int q = 0; q < 10; ++q) eight[q + (q >= 7 ? 1 : 0)] = sums[q].lo + sums[q].hi;
+            const f8 low = sums_of_four(eight[0], eight[4], eight[1], eight[5]);
+            const f8 high = sums_of_four(eight[2], eight[6], eight[3], eight[7]);
+            const f8 third = sums_of_four(eight[8], eight[10], eight[9], eight[11]);
+            // Transposed pairs are added last.
+            const f8 first_rows = __builtin_shufflevector(low, high, 0, 2, 8, 10, 4, 6, 12, 14)
+                + __builtin_shufflevector(low, high, 1, 3, 9, 11, 5, 7, 13, 15);
+            const f4 third_row = __builtin_shufflevector(third, third, 0, 2, 4, 6)
+                + __builtin_shufflevector(third, third, 1, 3, 5, 7);
+            __builtin_memcpy(out, &first_rows, sizeof(first_rows));
+            __builtin_memcpy(out + 8, &third_row, sizeof(third_row));
         }
-        for (int q = 0; q < 10; ++q) {
-            const auto four = sums[q].lo + sums[q].hi;
-            const auto two = four.lo + four.hi;
-            // Entry 7 is padding.
-            out[q + (q >= 7 ? 1 : 0)] = two[0] + two[1];
-        }
+    }
+    for (; begin < end; ++begin) {
+        if (begin + BATCH < end) __builtin_prefetch(out_of(begin + BATCH), 1);
+        for (int q = 0; q < 12; ++q) out_of(begin)[q] = 0.0f;
     }
 """
 )

@@ -8,21 +8,12 @@ import warp as wp
 from egs_warp.kernels.render import composite_cpu, composite_cuda
 from egs_warp.kernels.render.ellipse import TILE, TILE_PIXELS, is_tile_enabled
 from egs_warp.kernels.render.pixel_gradients import pixel_gradient
+from egs_warp.kernels.render.vector_math import on_cpu
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
-def _by_device(*, cpu: str = "", cuda: str = "") -> str:
-    return f"""
-#if defined(__CUDA_ARCH__)
-{cuda}
-#else
-{cpu}
-#endif
-"""
-
-
-@wp.func_native(_by_device(cpu=composite_cpu.FORWARD, cuda=composite_cuda.FORWARD))
+@wp.func_native(on_cpu(composite_cpu.FORWARD, cuda=composite_cuda.FORWARD))
 def composite_tile(
     width: wp.int32,
     height: wp.int32,
@@ -48,7 +39,7 @@ def composite_tile(
     ...
 
 
-@wp.func_native(_by_device(cpu=composite_cpu.BACKWARD))
+@wp.func_native(on_cpu(composite_cpu.BACKWARD))
 def composite_backward_tile(
     width: wp.int32,
     height: wp.int32,
@@ -69,7 +60,7 @@ def composite_backward_tile(
     ...
 
 
-@wp.func_native(_by_device(cuda=composite_cuda.BACKWARD))
+@wp.func_native(on_cpu("", cuda=composite_cuda.BACKWARD))
 def composite_backward_block(
     width: wp.int32,
     height: wp.int32,

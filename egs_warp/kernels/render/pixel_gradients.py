@@ -43,7 +43,7 @@ def pixel_gradient(
 
 @wp.kernel
 def pixel_gradients_kernel(
-    first: wp.int32,
+    first_row: wp.int32,
     # In:
     colour: wp.array2d[wp.vec3],
     alpha: wp.array2d[wp.float32],
@@ -52,21 +52,22 @@ def pixel_gradients_kernel(
     alpha_gradient: wp.array2d[wp.float32],
     depth_gradient: wp.array2d[wp.float32],
     # Out:
-    sum_gradient_out: wp.array[wp.vec4],
-    remaining_out: wp.array[wp.float32],
+    sum_gradient_out: wp.array2d[wp.vec4],
+    remaining_out: wp.array2d[wp.float32],
 ):
-    """Compute ``pixel_gradient`` for every pixel. Used on a CPU only; the backward kernel on a GPU calls
+    """Compute ``pixel_gradient`` for every pixel of one row. Used on a CPU only; the backward kernel on a GPU calls
     ``pixel_gradient`` itself."""
-    i = wp.tid() + first
-    by_sums, remaining = pixel_gradient(
-        i / colour.shape[1],
-        i % colour.shape[1],
-        colour,
-        alpha,
-        depth,
-        colour_gradient,
-        alpha_gradient,
-        depth_gradient,
-    )
-    sum_gradient_out[i] = by_sums
-    remaining_out[i] = remaining
+    row = wp.tid() + first_row
+    for column in range(colour.shape[1]):
+        by_sums, remaining = pixel_gradient(
+            row,
+            column,
+            colour,
+            alpha,
+            depth,
+            colour_gradient,
+            alpha_gradient,
+            depth_gradient,
+        )
+        sum_gradient_out[row, column] = by_sums
+        remaining_out[row, column] = remaining

@@ -62,7 +62,13 @@ def rotation_matrix(q: wp.vec4) -> wp.mat33:
 
 
 @wp.func
-def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple[wp.vec3, wp.vec3]:
+def scale_of(log_scale: wp.vec3) -> wp.vec3:
+    """Return the scales of a Gaussian, the diagonal of S."""
+    return wp.vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
+
+
+@wp.func
+def screen_axes(view: View, p: wp.vec3, q: wp.vec4, scale: wp.vec3) -> tuple[wp.vec3, wp.vec3]:
     """Return rows x and y of J W R S at the camera-space point ``p``; the screen covariance is their Gram matrix."""
     inv_z = 1.0 / p[2]
     # As in gsplat and Kerbl et al., the Jacobian is evaluated at most 15 % outside the image, because it grows without
@@ -73,7 +79,6 @@ def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple
     right = wp.vec3(axes[0, 0], axes[0, 1], axes[0, 2])
     down = wp.vec3(axes[1, 0], axes[1, 1], axes[1, 2])
     forward = wp.vec3(axes[2, 0], axes[2, 1], axes[2, 2])
-    scale = wp.vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
     row_x = view.fx * inv_z * (right - tx * forward)
     row_y = view.fy * inv_z * (down - ty * forward)
     return wp.cw_mul(row_x, scale), wp.cw_mul(row_y, scale)
@@ -110,6 +115,12 @@ def screen_covariance(row_x: wp.vec3, row_y: wp.vec3) -> ScreenCovariance:
     return covariance
 
 
+@wp.func
+def colour_and_depth(sum: wp.vec3, depth: wp.float32) -> wp.vec4:
+    """Return the colour for an SH sum, and the depth."""
+    return wp.vec4(wp.max(sum[0] + 0.5, 0.0), wp.max(sum[1] + 0.5, 0.0), wp.max(sum[2] + 0.5, 0.0), depth)
+
+
 @wp.kernel
 def project_kernel(
     first: wp.int32,
@@ -127,7 +138,7 @@ def project_kernel(
     colour_depth_out: wp.array[wp.vec4],
     tile_count_out: wp.array[wp.int64],
 ):
-    """Compute screen ellipse, falloff and colour of every Gaussian; an invisible Gaussian reaches no tile.
+    """Compute screen ellipse, falloff and colour of every Gaussian (CUDA); an invisible Gaussian reaches no tile.
 
     The ellipse is stored in Cholesky form: with u = dx + shear dy, -ln(alpha / opacity) = a u^2 + v dy^2. Its terms are
     all positive, whereas the usual conic suffers cancellation for long thin splats.
@@ -145,7 +156,7 @@ def project_kernel(
     p = view.rotation * mean + view.translation
     if p[2] < view.near or p[2] > view.far:
         return
-    row_x, row_y = screen_axes(view, p, q, log_scale)
+    row_x, row_y = screen_axes(view, p, q, scale_of(log_scale))
     screen = screen_covariance(row_x, row_y)
     log_opacity = -wp.log(1.0 + wp.exp(-logit))
     if logit < -15.0:
@@ -180,6 +191,4 @@ def project_kernel(
     tile_count_out[g] = wp.int64(tiles)
     ellipse_out[g] = ellipse
     falloff_out[g] = falloff
-    colour_depth_out[g] = wp.vec4(
-        wp.max(colour[0] + 0.5, 0.0), wp.max(colour[1] + 0.5, 0.0), wp.max(colour[2] + 0.5, 0.0), p[2]
-    )
+    colour_depth_out[g] = colour_and_depth(colour, p[2])

@@ -37,6 +37,6 @@ float egsShade(sampler2D shade, vec2 uv, float softness, float spread) {
   ${Array.from({ length: NEAR_SAMPLES }, (_, k) => nearSample(k)).join("\n  ")}
   ${Array.from({ length: WIDE_SAMPLES }, (_, k) => wideSample(k)).join("\n  ")}
   near /= ${NEAR_SAMPLES}.0;
-  return (1.0 - 0.45 * near.x) * (1.0 - 0.4 * wide) * (1.0 - near.y);
+  return (1.0 - 0.55 * near.x) * (1.0 - 0.4 * wide) * (1.0 - near.y);
 }
 `;

@@ -61,7 +61,6 @@ interface Entry {
   bytes: number;
   lower?: number[];
   step?: number[] | undefined;
-  delta?: boolean;
 }
 
 type Entries = Record<string, Entry>;
@@ -72,6 +71,7 @@ interface BodyText {
   degree: number;
   antialiased: boolean;
   max_stretch?: number;
+  node_step?: number;
   arrays: Entries;
   blocks?: { first: number; frames: number; arrays: Entries }[];
 }
@@ -81,7 +81,7 @@ type Arrays = Map<string, Stored | Float32Array>;
 
 const TYPES = { uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, float32: Float32Array } as const;
 const MAGIC = "EGSB";
-const VERSION = 1;
+const VERSION = 2;
 const HEAD_BYTES = 12;
 /** Kinds of carriers of splats; see the specification. */
 const TET = 0;
@@ -120,12 +120,17 @@ export async function readBundle(stream: ReadableStream<Uint8Array>): Promise<Bu
     return arrays;
   };
   const bodies: BundleBody[] = [];
-  for (const body of bodyTexts) bodies.push(bodyOf(body, await read(body.arrays)));
-  const moving = bodies.flatMap(({ cage }, k) => (cage === undefined ? [] : [{ cage, text: bodyTexts[k]! }]));
+  const moving: { cage: BundleCage; track: Track; text: BodyText }[] = [];
+  for (const text of bodyTexts) {
+    const arrays = await read(text.arrays);
+    const body = bodyOf(text, arrays);
+    bodies.push(body);
+    if (body.cage !== undefined) moving.push({ cage: body.cage, track: new Track(arrays, text.node_step ?? 1), text });
+  }
   const readBlocks = async (number: number): Promise<void> => {
-    for (const { cage, text: body } of moving) {
+    for (const { cage, track, text: body } of moving) {
       const block = body.blocks?.[number];
-      if (block !== undefined) cage.frames.push(...framesOf(await read(block.arrays)));
+      if (block !== undefined) cage.frames.push(...track.framesOf(arrayOf(await read(block.arrays), "residuals")));
     }
   };
   await readBlocks(0);
@@ -211,8 +216,6 @@ async function numbersOf(source: ByteSource, entry: Entry): Promise<Stored | Flo
   for (let plane = 0; plane < rowBytes; plane++) {
     for (let k = 0; k < count; k++) bytes[k * rowBytes + plane] = planes[plane * count + k]!;
   }
-  // Typed arrays of integers wrap around, as the encoder does.
-  if (entry.delta) for (let k = components; k < stored.length; k++) stored[k]! += stored[k - components]!;
   const { lower, step } = entry;
   if (lower === undefined || step === undefined) return stored;
   const numbers = new Float32Array(stored.length);
@@ -304,15 +307,46 @@ function quaternions(vectors: Float32Array): Float32Array {
   return result;
 }
 
-/** Return the node positions of the frames of a block. */
-function framesOf(arrays: Arrays): Float32Array[] {
-  const [origins, nodes] = [floats(arrays, "origins"), floats(arrays, "nodes")];
-  const width = (3 * nodes.length) / origins.length;
-  return Array.from({ length: origins.length / 3 }, (_, frame) => {
-    const positions = nodes.slice(frame * width, (frame + 1) * width);
-    for (let k = 0; k < width; k++) positions[k]! += origins[3 * frame + (k % 3)]!;
-    return positions;
-  });
+/** Positions of the nodes of a body, decoded block by block. */
+class Track {
+  private readonly order: Stored | Float32Array;
+  private readonly parents: Stored | Float32Array;
+  private readonly weights: Float32Array;
+  /** Positions of the nodes in the last frame that was decoded, in steps. */
+  private readonly last: Float64Array;
+
+  constructor(
+    arrays: Arrays,
+    private readonly step: number,
+  ) {
+    this.order = arrayOf(arrays, "order");
+    this.parents = arrayOf(arrays, "parents");
+    this.weights = floats(arrays, "weights");
+    this.last = Float64Array.from(floats(arrays, "rest_nodes"), (x) => Math.floor(x / step + 0.5));
+  }
+
+  /** Return the node positions of the frames of a block. */
+  framesOf(residuals: Stored | Float32Array): Float32Array[] {
+    const count = this.order.length;
+    const width = this.weights.length / count;
+    // Displacements of the nodes from the frame before, in steps; by position in the order.
+    const moved = new Float64Array(3 * count);
+    return Array.from({ length: residuals.length / (3 * count) }, (_, frame) => {
+      for (let k = 0; k < count; k++) {
+        for (let axis = 0; axis < 3; axis++) {
+          let sum = 0.5;
+          for (let p = 0; p < width; p++) {
+            sum += this.weights[k * width + p]! * moved[3 * this.parents[k * width + p]! + axis]!;
+          }
+          const stored = residuals[3 * (frame * count + k) + axis]!;
+          const displacement = Math.floor(sum) + (stored % 2 === 1 ? -(stored + 1) / 2 : stored / 2);
+          moved[3 * k + axis] = displacement;
+          this.last[3 * this.order[k]! + axis]! += displacement;
+        }
+      }
+      return Float32Array.from(this.last, (x) => this.step * x);
+    });
+  }
 }
 
 function arrayOf(arrays: Arrays, name: string): Stored {

@@ -1,0 +1,60 @@
+"""Steered walks: the direction around other bodies and obstacles, and the command that turns to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.motions.steering import free_direction, steering_command
+
+GOAL = np.array([4.0, 0.0])
+
+
+def direction(discs: list[tuple[list[float], list[float], float]], blocked: object = None) -> np.ndarray:
+    """Return the direction from the origin to ``GOAL`` at 0.3 m/s."""
+    arrays = [(np.array(centre), np.array(velocity), apart) for centre, velocity, apart in discs]
+    return free_direction(
+        np.zeros(2),
+        GOAL,
+        arrays,
+        (lambda point: False) if blocked is None else blocked,  # pyright: ignore[reportArgumentType]
+        speed=0.3,
+        height=1.0,
+        horizon=4.0,
+    )
+
+
+def test_the_direct_way_is_taken_if_nothing_is_on_it() -> None:
+    np.testing.assert_allclose(direction([([1.0, 2.0], [0.0, 0.0], 0.6)]), [1.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("offset", [0.2, -0.2])
+def test_a_body_on_the_way_is_passed_on_the_shorter_side_with_the_required_distance(offset: float) -> None:
+    x, y = direction([([1.0, offset], [0.0, 0.0], 0.6)])
+    assert np.sign(y) == -np.sign(offset)
+    # Distance from the body to the line of the walk.
+    assert abs(x * offset - y) >= 0.58
+
+
+def test_bodies_that_meet_both_keep_to_the_right() -> None:
+    _, y = direction([([1.5, 0.0], [-0.3, 0.0], 0.6)])
+    assert y < 0.0
+
+
+def test_a_body_that_leaves_in_time_is_not_avoided() -> None:
+    crossing = direction([([1.0, 0.0], [0.0, 0.6], 0.6)])
+    assert direction([([1.0, 0.0], [0.0, 0.0], 0.6)])[1] != 0.0
+    np.testing.assert_allclose(crossing, [1.0, 0.0], atol=0.2)
+
+
+def test_an_obstacle_is_walked_round() -> None:
+    ahead = direction([], lambda point: point[0] > 0.3 and point[1] > -0.2)
+    assert ahead[1] < -0.3
+
+
+def test_a_command_turns_on_the_spot_only_for_large_angles() -> None:
+    turning, going = steering_command(0.0, np.array([0.0, 1.0])), steering_command(0.1, np.array([1.0, 0.0]))
+    assert turning.forward == 0.0 and turning.turn > 0.0
+    assert going.forward > 0.1 and going.turn < 0.0
+    # Across the discontinuity of the angle.
+    assert steering_command(3.0, np.array([np.cos(-3.0), np.sin(-3.0)])).turn > 0.0

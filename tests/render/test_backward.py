@@ -1,0 +1,47 @@
+"""Backward pass of the projection by lanes on a CPU against the kernel for one Gaussian."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from egs_warp.geometry.camera import Camera
+from egs_warp.kernels.render.backward import project_backward_kernel
+from egs_warp.kernels.render.backward_cpu import project_backward_block_kernel
+from egs_warp.kernels.render.projection_cpu import BLOCK
+from egs_warp.render.projection import view_from_camera
+
+
+@pytest.mark.parametrize(("antialiased", "coefficients"), [(0, 1), (1, 16)])
+def test_lanes_equal_the_kernel_for_one_gaussian(antialiased: int, coefficients: int) -> None:
+    """Random moments of 1003 Gaussians, a third of which reach no tile."""
+    random, count = np.random.default_rng(5), 1003
+    slot_end = np.cumsum(random.integers(0, 3, count))
+
+    def array(values: np.ndarray, dtype: type = wp.float32) -> wp.array:
+        return wp.array(values, dtype=dtype, device="cpu")
+
+    rotations = random.normal(size=(count, 4))
+    rotations[:9] = 0.0
+    inputs = [
+        array(random.uniform(-2, 2, (count, 3)), wp.vec3),
+        array(rotations, wp.vec4),
+        array(random.normal(-2.5, 0.7, (count, 3)), wp.vec3),
+        array(random.normal(0.0, 3.0, count)),
+        array(random.normal(0, 0.4, (count, coefficients, 3)), wp.vec3),
+        array(slot_end, wp.int64),
+        array(random.normal(size=(slot_end[-1], 3, 4)), wp.vec4),
+    ]
+    eye, up = np.array([0.3, -0.4, -5.0]), np.array([0, -1.0, 0])
+    view = view_from_camera(Camera.look_at(eye, np.zeros(3), up, width=67, height=45))
+    results = []
+    for kernel, rows in ((project_backward_kernel, count), (project_backward_block_kernel, -(-count // int(BLOCK)))):
+        outputs = [wp.empty_like(values) for values in inputs[:5]]
+        wp.launch(kernel, rows, inputs=[0, view, antialiased, *inputs], outputs=outputs, device="cpu")
+        results.append([values.numpy() for values in outputs])
+    for expected, got in zip(*results, strict=True):
+        scale = np.abs(expected.reshape(count, -1)).max(axis=1)
+        error = np.abs(got - expected).reshape(count, -1).max(axis=1)
+        assert (error <= 1e-4 * scale + 1e-6).all()
+        assert (scale > 0).any() and (scale == 0).any()
