@@ -58,7 +58,7 @@ def test_a_body_moves_only_if_its_capture_point_has_left_the_support(mesh: Any, 
 
 @pytest.mark.parametrize("angle", [0.0, 0.5 * np.pi, np.pi])
 def test_a_hop_follows_the_fall(angle: float) -> None:
-    """The hop leads along the velocity, and is longer after a stronger push, up to the maximum."""
+    """The hop is along the velocity, and is longer after a stronger push, up to the maximum."""
     place = block_place()
     along = np.array([np.cos(angle), np.sin(angle), 0.0])
     hops = [begun(place, speed * along) for speed in (1.4, 2.0, 9.0)]
