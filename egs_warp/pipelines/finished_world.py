@@ -148,4 +148,6 @@ def read_finished(folder: Path, *, background: Path | None = None) -> FinishedRu
 def check_no_background(background: Path | None) -> None:
     """Raise ``ArgumentError`` if a background is given for the run of a world."""
     if background is not None:
-        raise ArgumentError("background", "it is for the run of a single capture; leave it out", value=background)
+        raise ArgumentError(
+            "background", "a scene behind the body is for the run of a single capture; leave it out", value=background
+        )

@@ -239,7 +239,7 @@ def _with_edge(
     top = np.asarray(ndimage.median_filter(top, 5))
     nodes = field.nodes()
     at = ((nodes[..., :2] - lattice.origin[:2]) / lattice.spacing).transpose(2, 0, 1)
-    # Half a cell more, because the outermost ground cells are ground up to their far side.
+    # Because of the dilation, the ground ends one cell beyond the far side of its outermost cells.
     wide = np.asarray(ndimage.binary_dilation(known))
     is_ground = ndimage.map_coordinates(wide.astype(float), at, order=1, mode="nearest") > 0.5
     lower = ndimage.map_coordinates(top, at, order=1, mode="nearest")

@@ -193,7 +193,7 @@ def _prepared(
             cloud,
             spec,
             cameras=[one.camera for one in posed],
-            # Later captures lack objects that the photos still show.
+            # Only for the capture itself, because the photos show objects that have been cut out.
             photographs=photographs_in_colours_of(cloud, posed) if isinstance(cloud, Capture) else None,
             up=direction,
             plane=plane,
