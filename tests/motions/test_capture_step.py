@@ -71,7 +71,7 @@ def test_a_hop_follows_the_fall(angle: float) -> None:
 
 
 def test_feet_step_under_the_capture_point() -> None:
-    """The walk starts with a swing, of the feet with the smaller load, and leads along the velocity."""
+    """The walk starts with a swing of the feet with the smaller load, and is along the velocity."""
     place = block_place(coarse_stool())
     walk = begun(place, np.array([0.0, -2.0, 0.0]))
     assert isinstance(walk, Walk)

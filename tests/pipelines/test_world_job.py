@@ -1,4 +1,4 @@
-"""``simulate_many`` runs jobs of a world in worker processes, with the bits of a run alone."""
+"""``simulate_many`` runs jobs of a world in worker processes, with the same bits as single runs."""
 
 from __future__ import annotations
 
