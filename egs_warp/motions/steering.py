@@ -1,4 +1,4 @@
-"""Walks that are steered at every time step: towards, after or away from other bodies, and around obstacles.
+"""Walks that are steered at every time step towards, after or away from other bodies, and avoid bodies and obstacles.
 
 Positions are metres in the ground frame in which the motion starts: forward and to the left. The direction is chosen
 among samples by the predicted clearance (the dynamic window approach of Fox, Burgard and Thrun, 1997).
