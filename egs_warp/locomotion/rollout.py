@@ -125,7 +125,7 @@ class BodyRun:
 
     def _support_report(self) -> StepReport:
         """Return the last report with only the contacts that support the body: those with the ground, and those with
-        other bodies below it. A motion must not treat a body that pushes it from the side as its ground."""
+        other bodies below it. A motion must not treat another body that pushes from the side as its ground."""
         report = self.reports[-1]
         if not self._has_others:
             return report

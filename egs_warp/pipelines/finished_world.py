@@ -131,7 +131,7 @@ class FinishedWorld:
         return FilmedWorld(bodies, self.solids)
 
     def splats_of(self) -> Callable[[int], GaussianCloud]:
-        """Return the function that gives the splats of all bodies in a frame; each call overwrites the last result."""
+        """Return the function for the splats of all bodies in a frame; each call overwrites its last result."""
         filmed = self.filmed
         deformer = filmed.joint_deformer()
         return lambda frame: deformer.deform(filmed.poses(frame)).cloud
@@ -148,4 +148,6 @@ def read_finished(folder: Path, *, background: Path | None = None) -> FinishedRu
 def check_no_background(background: Path | None) -> None:
     """Raise ``ArgumentError`` if a background is given for the run of a world."""
     if background is not None:
-        raise ArgumentError("background", "a run of a world has no capture behind its bodies", value=background)
+        raise ArgumentError(
+            "background", "a scene behind the body is for the run of a single capture; leave it out", value=background
+        )

@@ -82,7 +82,9 @@ def test_incomplete_folders_are_reported(folder: Path, tmp_path: Path, capsys: p
     assert f"--to skin: a skin has one body; export the folder of a body, such as {folder / 'block'}" in (
         capsys.readouterr().err
     )
-    with pytest.raises(UserError, match=r"background .*: a run of a world has no capture behind its bodies"):
+    with pytest.raises(
+        UserError, match=r"background .*: a scene behind the body is for the run of a single capture; leave it out"
+    ):
         read_finished(folder, background=tmp_path / "a.ply")
     shape = (folder / "block" / SHAPE).read_bytes()
     (folder / "block" / SHAPE).write_bytes((folder / "box-1" / SHAPE).read_bytes())
