@@ -214,10 +214,10 @@ def _known_ground(lattice: _Lattice, heights: np.ndarray, feet: np.ndarray) -> n
     """Return the columns (nx, ny) bool that have ground at ``heights`` (nx, ny) m. The columns of the ``feet`` (n, 3)
     m, which are the lower parts of the objects, and small holes count as ground."""
     band = np.abs(lattice.axis(2) - heights[..., None]) <= _BAND * lattice.spacing
-    known = (lattice.occupied & band).any(axis=2)
+    known = np.asarray((lattice.occupied & band).any(axis=2))
     at = lattice.cells_of(feet)
     known[at[:, 0], at[:, 1]] = True
-    known = np.asarray(ndimage.binary_closing(np.pad(known, _CLOSED, mode="edge"), iterations=_CLOSED))
+    known = np.asarray(ndimage.binary_closing(np.pad(known, _CLOSED, mode="edge"), iterations=_CLOSED), bool)
     known = known[_CLOSED:-_CLOSED, _CLOSED:-_CLOSED]
     for mask, limit in ((known, _MIN_GROUND), (~known, _MAX_HOLE)):
         parts, _ = connected_parts(mask)
@@ -260,7 +260,7 @@ def _boxes(
     for name, points in objects.items():
         near = np.zeros(above.shape, bool)
         near[tuple(lattice.cells_of(points).T)] = True
-        near = np.asarray(ndimage.binary_dilation(near, np.ones((3, 3, 3), bool), iterations=_CLEARANCE))
+        near = np.asarray(ndimage.binary_dilation(near, np.ones((3, 3, 3), bool), iterations=_CLEARANCE), bool)
         free |= near & (z > -planes[name].offset + 0.25 * spacing)
     solid = _filled(lattice.occupied | ~above, free) & above & ~free
     labels = np.zeros(solid.shape, np.int32)

@@ -87,7 +87,8 @@ def _ground_cloud(obstacles: SceneObstacles, device: str) -> GaussianCloud:
         spacing = float((high - low)[:2].max()) / 100.0
         x, y = np.meshgrid(np.arange(low[0], high[0], spacing), np.arange(low[1], high[1], spacing))
         nodes = np.stack([x, y, np.zeros_like(x)], axis=-1)
-    slopes = np.stack(np.gradient(nodes[..., 2], spacing)[::-1], axis=-1)
+    along_x, along_y = np.gradient(nodes[..., 2], spacing)
+    slopes = np.stack([along_y, along_x], axis=-1)
     normals = np.concatenate([-slopes, np.ones((*slopes.shape[:2], 1))], axis=-1).reshape(-1, 3)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = nodes.reshape(-1, 3)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -169,10 +170,10 @@ def _make_body(
 ) -> Creature | Prop:
     cloud, plane = prepared.scenes[name].object, _plane_of(prepared, name)
     if body.is_prop:
-        density = {} if body.density is None else {"density": body.density}
+        density: dict[str, Any] = {} if body.density is None else {"density": body.density}
         return make_prop(cloud, plane=plane, metres_per_unit=metres_per_unit, **density)
-    nodes = {} if body.nodes is None else {"nodes": body.nodes}
-    options = CreatureOptions(metres_per_unit=metres_per_unit, front=body.front, seen_from=seen_from, **nodes)
+    options = CreatureOptions(metres_per_unit=metres_per_unit, front=body.front, seen_from=seen_from)
+    options = options if body.nodes is None else replace(options, nodes=body.nodes)
     return make_creature(cloud, plane=plane, options=options)
 
 

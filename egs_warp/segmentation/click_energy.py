@@ -212,7 +212,8 @@ def _framing(surface: SurfaceGraph, seeds: np.ndarray) -> tuple[np.ndarray, np.n
 def _colour_ratio(colours: np.ndarray, area: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return (k,), the log-likelihood ratio of each of the ``colours`` (k, 3) under the smoothed histograms of two sets
     (k,) bool of supervoxels; zero if one of them is empty."""
-    cell = np.ravel_multi_index(np.minimum((colours * _BINS).astype(int), _BINS - 1).T, (_BINS,) * 3)
+    bins = np.minimum((colours * _BINS).astype(int), _BINS - 1)
+    cell = np.asarray(np.ravel_multi_index(tuple(bins.T), (_BINS,) * 3))
     densities = []
     for side in (own, other):
         total = float(area[side].sum())

@@ -78,7 +78,7 @@ def test_two_objects_of_a_scene_become_bodies_of_one_world(tmp_path: Path, capsy
     """Two pawns 1.5 apart on a board: their places in the world are their places in the capture, the board ends at its
     edge, and the collision mesh has the block beside them at its place in the capture."""
     thing = pawn(gaussian_count=3000, device="cpu").cloud
-    shifted = replace(thing, means=wp.array(thing.means.numpy() + np.float32([1.5, 0.0, 0.0]), dtype=wp.vec3))
+    shifted = replace(thing, means=wp.array(thing.means.numpy() + np.array([1.5, 0.0, 0.0], np.float32), dtype=wp.vec3))
     board = blocks(((-1.5, -1.5, -0.04), (3.0, 1.5, 0.0)), ((0.6, 0.9, 0.0), (1.0, 1.3, 0.5)))
     write_ply(tmp_path / "room.ply", concatenate(*(with_degree(each, 0) for each in (thing, shifted, board))))
     out, mesh = tmp_path / "out", tmp_path / "mesh.glb"

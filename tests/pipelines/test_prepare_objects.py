@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -57,14 +58,8 @@ class FakePreparer:
         retained = np.arange(with_hole.count) != with_hole.count - 1
         new = row(3, 0.5)
         filled_cloud = concatenate(with_hole.subset(retained), new)
-        filled = InpaintResult(
-            filled_cloud,
-            np.arange(filled_cloud.count) >= filled_cloud.count - 3,
-            retained,
-            *([None] * 4),  # type: ignore[arg-type]
-            {},
-            (),
-        )
+        is_new, absent = np.arange(filled_cloud.count) >= filled_cloud.count - 3, cast(Any, None)
+        filled = InpaintResult(filled_cloud, is_new, retained, absent, absent, absent, absent, {}, ())
         located = LocatedPlane(plane, None, np.zeros(3), 1.0, segmentation, ())
         parts = cloud.subset(spec.picked), filled_cloud, with_hole
         return PreparedScene(*parts, plane, None, located, ("done",), filled=filled)

@@ -259,7 +259,7 @@ def _record() -> dict[str, bytes]:
 
 def _replayed(path: Path) -> None:
     slid = slide()
-    replay = Replay(path.parent, slid.recorder().start, slid.stepper.detector)
+    replay = Replay(path.parent, slid.recorder().start)
     reports = [report for _ in slid.reports for report in replay.step(0)]
     assert len(reports) == 8 and all(np.isfinite(report.state.positions).all() for report in reports)
 
