@@ -79,12 +79,10 @@ def support_report(stepper: LocomotionStepper, report: StepReport) -> StepReport
     contacts, up = report.contacts, -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
     kept = (contacts.faces >= 0) | (contacts.axes[:, 0] @ up > _MIN_SUPPORT_COSINE)
     contacts = replace(contacts, **{name: value[kept] for name, value in contacts.batched_fields()})
-    # The weights of a point of another body sum to -1.
-    weights = contacts.weights / contacts.weights.sum(axis=1, keepdims=True)
     gaps, _ = stepper.detector.gaps(report.state.positions)
     return replace(
         report,
-        contacts=replace(contacts, weights=np.where(contacts.faces[:, None] < 0, weights, contacts.weights)),
+        contacts=contacts,
         forces=report.forces[kept],
         end_gaps=report.end_gaps[kept],
         min_gap=float(gaps.min()),
