@@ -11,8 +11,8 @@ body that is pushed by 1 m sqrt(g H) at 0.8 of its height succeeds if it stands 
 Slip is the displacement of a foot while it is on the ground, divided by the stride. Cost of transport is the muscles'
 work divided by m g times the distance.
 
-A body that falls performs gentler takes, as with ``egs-warp animate``. A cell that succeeds only in a later take counts
-for ``success_rate_with_retakes``, not for ``success_rate``, and the table names the take.
+If a body falls, the motion is simulated again in a gentler form, as with ``egs-warp animate``. A cell that succeeds
+only in a later take counts for ``success_rate_with_retakes``, not for ``success_rate``, and the table names the take.
 
 A motion that is rejected with an error is counted as a failure; getting up is counted separately and has no aim. A ball
 is judged by its position and, if it does not roll, by its heading. Captures are included if they are available on this

@@ -1,11 +1,11 @@
-"""Largest push, and largest gust of one second, that a standing body withstands, and from which it recovers.
+"""Largest push, and largest gust of one second, that a standing body withstands or from which it recovers.
 
 python benchmarks/pushes.py [--quick] [--nodes N] [--bodies NAME ...] [--pushes LINE ...] [--json PATH]
 
 A body recovers from a push if it does not fall and ends at rest within 5 degrees of upright, wherever its feet are. It
-withstands the push if, in addition, no sole ever moves 0.05 body heights or more. Sizes are multiples of 0.05 m sqrt(g
-H), up to 3.15; the size of a gust is its total impulse. They
-are found by bisection, which assumes that a body that withstands a push also withstands smaller ones.
+withstands the push if, in addition, no sole ever moves 0.05 body heights or more. Sizes are multiples of
+0.05 m sqrt(g H), up to 3.15; the size of a gust is its total impulse. They are found by bisection, which assumes that a
+body that withstands a push, or recovers from it, does the same for smaller ones.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def largest(
     creature: Creature, kind: str, result: str = "withstood", *, minimum: float = 0.0
 ) -> tuple[float, list[Row]]:
     """Return the strongest push of ``kind`` with a ``result``, "withstood" or "recovered", and the rows of all pushes
-    that were tried; a push of ``minimum`` m sqrt(g H) is known to have it."""
+    that were tried; a push of ``minimum`` m sqrt(g H) is known to have this result."""
     low, high, tried = round(minimum / STEP), MAX_STEPS + 1, []
     while high - low > 1:
         middle = (low + high) // 2

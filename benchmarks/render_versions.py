@@ -1,4 +1,4 @@
-"""Time of the renderer on a CPU beside that of an older checkout, in two processes that take turns."""
+"""Time of the renderer on a CPU and that of an older checkout, in two processes that alternate."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ _WORKER = "from render_versions import serve; serve()"
 
 
 def compare_versions(cloud: GaussianCloud, camera: Camera, *, old: Path, repeats: int) -> dict[str, dict[str, float]]:
-    """Return, by task, the median milliseconds of wall and processor time of both versions, and the ratio of the wall
-    times.
+    """Return, by task, the median milliseconds of wall and processor time of both versions, and the ratios old / new of
+    both times.
 
     Args:
-        cloud, camera: the picture.
-        old: checkout of the older version, with the same interface of ``egs_warp.render``.
-        repeats: pictures by each version.
+        cloud, camera: scene and camera of the rendered image.
+        old: checkout of the older version, whose ``egs_warp.render`` must have the same interface.
+        repeats: number of measurements of each version.
     """
     with tempfile.TemporaryDirectory() as place:
         scene = Path(place) / "scene.pickle"

@@ -13,7 +13,7 @@ Aims on a CPU: ``apart_cost`` (two bodies that never meet take at most 1.1 times
 ``sleeping_cost`` (two creatures among 30 sleeping props take at most 1.5 times as long as two alone).
 
 With ``--starts``, the named examples are simulated from ``--runs`` random starts instead. Aims: ``chess`` (the
-struck piece lies at the end of 18 of 20 runs), ``push`` (the box is up the ramp at the end of 16 of 20 runs).
+struck piece lies at the end of at least 18 of 20 runs), ``push`` (the box is up the ramp at the end of at least 16).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ MIN_SUCCESS = {"chess": 18 / 20, "push": 16 / 20}
 FRAMES = {"chess": 240, "push": 900}
 """Number of frames of each run from a random start."""
 LYING_TILT = 60.0
-"""Tilt from which a piece lies, degrees."""
+"""Tilt above which a piece lies, degrees."""
 MAX_FRAME = 33.0
 """Maximum time of a frame for ``cpu_two_realtime``, ms."""
 

@@ -1,4 +1,4 @@
-"""A pawn jumps three squares, strikes another piece in passing, and lands beside it; the piece topples.
+"""A pawn jumps three squares, strikes another piece in passing, and lands beyond it; the piece topples.
 
 Writes the film, the contact sheet, the report, and a trajectory and a report for each body.
 """
@@ -28,7 +28,7 @@ def main(arguments: list[str] | None = None) -> egs.WorldReport:
     """Run the example and return the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/chess"))
-    parser.add_argument("--seed", type=int, help="random position, heading and density of the pieces")
+    parser.add_argument("--seed", type=int, help="seed of random deviations from the default start")
     parser.add_argument("--nodes", type=int, default=100, help="approximate number of cage nodes of the pawn")
     parser.add_argument("--frames", type=int, help="number of frames (default: until all bodies are at rest)")
     parser.add_argument("--size", type=int, default=512)
@@ -47,8 +47,8 @@ def start(seed: int | None, *, nodes: int = 100, device: str = "cpu") -> tuple[e
     """Return the world and the motion of the attacker.
 
     Args:
-        seed: of the random positions (up to a tenth of a square off), heading (up to 20 degrees off) and density (40 to
-            90 kg/m^3); None gives the start without deviations.
+        seed: seed of the random position of the piece (up to a tenth of a square off), its density (40 to 90 kg/m^3)
+            and the heading of the pawn (up to 20 degrees off); None gives the start without deviations.
         nodes: approximate number of cage nodes of the pawn.
         device: Warp device.
     """

@@ -19,14 +19,15 @@ RAMP_AT, RAMP_LENGTH, RAMP_HEIGHT = 1.4, 1.2, 0.25
 """Distance of the foot of the ramp, its length along the ground and its rise, m."""
 
 UP_AT = RAMP_AT + 0.4 * LENGTH
-"""Position of the middle of the box from which it is up the ramp, m: at most a tenth of it is on the ground."""
+"""Position of the middle of the box from which the box counts as up the ramp, m: at most a tenth of it is still before
+the ramp."""
 
 
 def main(arguments: list[str] | None = None) -> egs.WorldReport:
     """Run the example and return the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/push"))
-    parser.add_argument("--seed", type=int, help="random position and density of the box, and heading of the pawn")
+    parser.add_argument("--seed", type=int, help="seed of random deviations from the default start")
     parser.add_argument("--nodes", type=int, default=100, help="approximate number of cage nodes of the pawn")
     parser.add_argument("--frames", type=int, help="number of frames (default: until all bodies are at rest)")
     parser.add_argument("--size", type=int, default=512)
@@ -45,9 +46,9 @@ def start(seed: int | None, *, nodes: int = 100, device: str = "cpu") -> tuple[e
     """Return the world and the motion of the pusher.
 
     Args:
-        seed: of the random position of the box (up to 0.05 m along and 0.1 m across the ramp), its heading (up to 10
-            degrees) and its density (30 to 90 kg/m^3), and the heading of the pawn (up to 20 degrees); None gives the
-            start without deviations.
+        seed: seed of the random position of the box (up to 0.05 m along and 0.1 m across the ramp), its heading (up to
+            10 degrees) and its density (30 to 90 kg/m^3), and the heading of the pawn (up to 20 degrees); None gives
+            the start without deviations.
         nodes: approximate number of cage nodes of the pawn.
         device: Warp device.
     """

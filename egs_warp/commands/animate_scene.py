@@ -26,8 +26,8 @@ _FLAGS = (
 
 
 def named_objects(values: Sequence[str] | None) -> dict[str, tuple[str, ...]]:
-    """Return the values of ``--object`` by the names of the objects, in the order in which the names first occur; an
-    empty dictionary if no value has a name.
+    """Return the values of ``--object`` by the names of the objects, in the order in which the names first occur. The
+    dictionary is empty if no value has a name.
 
     Raises ``UserError`` if only some of the values have a name.
     """
@@ -68,8 +68,8 @@ def motions_of(text: str, names: Sequence[str], props: Sequence[str]) -> dict[st
             break
         if not colon or name not in names:
             raise UserError(
-                f"--motion {part!r}: it has no name of an object{did_you_mean(name, names)}; give NAME: MOTION,"
-                f" separated by semicolons, for {', '.join(names)}"
+                f"--motion {part!r}: it does not begin with the name of an object{did_you_mean(name, names)}; give"
+                f" NAME: MOTION, separated by semicolons, for {', '.join(names)}"
             )
         if name in props:
             raise UserError(f"--motion {part!r}: {name} is a prop, which has no muscles; leave --prop {name} out")

@@ -39,9 +39,9 @@ def is_world(capture: str) -> bool:
 def check_flags(
     args: argparse.Namespace,
     allowed: Sequence[str],
-    problem: str = "is for a single capture; a world file describes its bodies; leave it out",
+    problem: str = "it is for a single capture; a world file describes its bodies; leave it out",
 ) -> None:
-    """Raise ``UserError`` with the ``problem`` for a flag of the command that is not ``allowed``."""
+    """Raise ``UserError`` with the text ``problem`` if a flag that is not ``allowed`` differs from its default."""
     for action in args.parser._actions:
         if action.dest in vars(args) and action.dest not in allowed and getattr(args, action.dest) != action.default:
             flag = action.option_strings[0] if action.option_strings else action.dest
@@ -89,7 +89,7 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
     with run_folder(args.out, command=ANIMATE_WORLD, overwrite=args.overwrite, resume=resume) as folder:
         if is_file:
             folder.begin_with(lambda: write_config(folder.file(NAME), args, args.parser))
-        # The parts are written first, so that a later error does not lose minutes of work.
+        # The parts of a scene are written at once, so that a later error does not lose minutes of work.
         progress = SceneProgress(
             print_note,
             lambda name, scene: write_object(name, scene, folder),
@@ -145,7 +145,7 @@ def _write_obstacles(
 
 
 def _folder_of(folder: RunFolder, name: str) -> Path:
-    """Return the folder of a body, which is created."""
+    """Create and return the folder of a body."""
     path = folder.folder(name)
     path.mkdir(exist_ok=True)
     return path

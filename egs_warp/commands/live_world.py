@@ -33,7 +33,8 @@ def live_world(args: argparse.Namespace) -> int:
     server = PageServer([], port=args.port, feed=WorldFeed(session, title=Path(args.capture).name))
     with server.serve_in_background() as thread, reserve_core():
         print(
-            f"open {server.address}\nevery browser that opens it steers another creature; end with Ctrl-C", flush=True
+            f"open {server.address}\neach browser that opens it steers one creature; end with Ctrl-C",
+            flush=True,
         )
         if not args.no_browser:
             webbrowser.open(server.address)

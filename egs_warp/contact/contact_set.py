@@ -185,7 +185,7 @@ class ContactSet(BatchedRecord):
         return replace(self, **arrays)
 
     def of_entries(self, entries: np.ndarray) -> ContactSet:
-        """Return the contacts of one world with the indices ``entries`` (k,)."""
+        """Return the contacts ``entries`` (k,) of this record of one world."""
         return replace(self, **{name: value[entries] for name, value in self.batched_fields()})
 
     def with_nodes_of(self, nodes: slice) -> ContactSet:

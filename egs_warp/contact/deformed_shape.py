@@ -14,7 +14,7 @@ from egs_warp.meshing.level_set import LevelSet
 from egs_warp.precision import Vec3
 
 _STRETCH = 1.01
-"""Upper bound of the stretch of a prop. A prop has a single tetrahedron, which extrapolates exactly."""
+"""Upper bound of the stretch of a prop. The map of its single tetrahedron also holds outside the tetrahedron."""
 
 
 class DeformedShape:

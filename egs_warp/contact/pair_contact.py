@@ -90,7 +90,7 @@ class PairContactDetector:
 
     def body_pairs(self, positions: np.ndarray) -> list[tuple[int, int]]:
         """Return the ordered pairs (a, b) of bodies whose inflated boxes overlap at ``positions`` (N, 3), both (a, b)
-        and (b, a), in ascending order. Two driven bodies are no pair.
+        and (b, a), in ascending order. Two driven bodies do not form a pair.
         """
         boxes = []
         for body, weights, part in zip(self.bodies, self._box_weights, self._split(positions), strict=True):
@@ -260,7 +260,7 @@ class _DeformedBody(DeformedShape):
         ]
         self.tet_from_point = wp.array(geometry.tet_from_point, dtype=int, device=device)
         self.close_tets = zeros((1, len(mesh.tets)), bool, device)
-        """Buffer for the tetrahedra that are close to another body."""
+        """(1, T) buffer, True for tetrahedra that are close to another body."""
         self.gaps = zeros((1, len(geometry.weights)), real, device)
         self._tets_of: dict[_DeformedBody, wp.array] = {}
 

@@ -35,7 +35,7 @@ class BatchedRecord:
         return replace(self, **{name: _rows(value, worlds) for name, value in self.batched_fields()})
 
     def with_world_axis(self) -> Self:
-        """Return this record of one world without a world axis as a record with an axis of one world."""
+        """Return this record, which has no world axis, as a record with a world axis of length 1."""
         return replace(self, **{name: _with_world_axis(value) for name, value in self.batched_fields()})
 
     @classmethod

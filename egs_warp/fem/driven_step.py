@@ -1,4 +1,4 @@
-"""The step of a body that follows a prescribed path: its end does not depend on forces."""
+"""The step of a body that follows a prescribed path: forces do not change the positions at its end."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class DrivenStep(StepProblem):
         return DrivenTangent(self, factors)
 
     def drive(self, contact_forces: np.ndarray) -> np.ndarray:
-        """Return the changes of velocity (N, 3) m/s by the drive: with them, the equation of a step without a drive
-        holds for the prescribed end and ``contact_forces`` (N, 3) N."""
+        """Return the velocities (N, 3) m/s that the drive adds to the nodes. With them, the prescribed end satisfies
+        the equation of a step without a drive, with ``contact_forces`` (N, 3) N."""
         left = super().residual(self.rigid_guess, None) - self.dt * contact_forces
         return left / self.node_mass[:, None]
 
@@ -55,7 +55,7 @@ class PathDrive:
 
     path: RigidPath
     start: np.ndarray
-    """(N, 3) m, positions of the nodes at time 0. The nodes have equal masses, as those of a prop."""
+    """(N, 3) m, positions of the nodes at time 0. The nodes have equal masses, as in a prop."""
 
     def step(self, body: SoftBody, state: BodyState, dt: float, drag: float) -> DrivenStep:
         """Return the step of ``dt`` s from ``state``; arguments as for ``StepProblem``."""

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 _MIN_FILL = 0.85
-"""Minimum occupied fraction of a layer of cells that a box grows by."""
+"""Minimum occupied fraction of a layer of cells that is added to a box."""
 _REST = 0.02
 """Fraction of the occupied cells that may stay uncovered."""
 _MIN_NEW_CELLS = 8

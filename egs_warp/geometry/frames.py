@@ -63,7 +63,7 @@ def kabsch_rotation(masses: np.ndarray, before: np.ndarray, after: np.ndarray) -
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotations (..., 3, 3) nearest to the ``matrix`` (..., 3, 3)."""
+    """Return the rotation (..., 3, 3) nearest to each ``matrix`` (..., 3, 3)."""
     u, _, vt = np.linalg.svd(matrix)
     signs = np.ones(matrix.shape[:-1])
     signs[..., 2] = np.sign(np.linalg.det(u @ vt))

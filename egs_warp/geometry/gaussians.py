@@ -26,7 +26,7 @@ _TRANSPARENT_LOGIT = -16.0
 _THIRD_BELOW = 0.43
 """Height of the mean above a plane at which a third of a normal distribution lies below it, in standard deviations."""
 _CUT_DEVIATIONS = 2.0
-"""Maximum distance from a plane of the mean of a Gaussian that is cut at it, in standard deviations."""
+"""Maximum distance between a plane and the mean of a Gaussian that is cut at the plane, in standard deviations."""
 MAX_VALUE, MAX_LOG_SCALE = 1e18, 41.0
 """Maximum magnitude of any number of a cloud, and maximum logarithm of a standard deviation: squares of numbers within
 these limits are finite in single precision."""
@@ -245,14 +245,14 @@ def hidden_below(cloud: GaussianCloud, plane: Plane, *, margin: float) -> Gaussi
 
 
 def cut_at(cloud: GaussianCloud, plane: Plane) -> GaussianCloud:
-    """Return ``cloud`` with each Gaussian that crosses ``plane`` replaced by one above it.
+    """Return ``cloud`` with each Gaussian that crosses ``plane`` replaced by a Gaussian for its part above the plane.
 
-    The new Gaussian has the mean and the covariance of the part above the plane: for the distance h from the plane and
-    the variance s^2 along its normal n, a = -h / s and l = phi(a) / (1 - Phi(a)),
+    The new Gaussian has the mean and the covariance of that part. With the distance h of the mean from the plane, the
+    variance s^2 along the normal n of the plane, a = -h / s and l = phi(a) / (1 - Phi(a)),
 
         mean' = mean + l C n / s,    C' = C - l (l - a) (C n) (C n)^T / s^2.
 
-    The opacity is multiplied by the part above the plane, 1 - Phi(a). Colours, number and order do not change.
+    The opacity is multiplied by the fraction above the plane, 1 - Phi(a). Colours, number and order do not change.
     Gaussians of which less than 2 % are below the plane, and those with less than 2 % above it, remain as they are.
     """
     heights = plane.heights(cloud.means.numpy()).astype(np.float64)

@@ -16,8 +16,8 @@ from egs_warp.short_repr import short_repr
 class RigidPath:
     """Rigid motion of a body that follows a path whatever pushes it, such as a lift or a swinging door.
 
-    The body starts at rest at time 0 and passes through the given points. It moves from one to the next with a cubic
-    polynomial of time and is at rest at each point.
+    The body starts at rest at time 0 and passes through the given points. Between two points, its position is a cubic
+    polynomial of time; it is at rest at each point.
     """
 
     __repr__ = short_repr
@@ -57,7 +57,7 @@ class RigidPath:
         return 0.0 if self.repeat else float(self.times[-1])
 
     def moved(self, positions: np.ndarray, time: float) -> np.ndarray:
-        """Return ``positions`` (N, 3) m, those of equal masses at time 0, at the ``time`` in s."""
+        """Return the positions (N, 3) m at ``time`` s of equal masses that are at ``positions`` (N, 3) m at time 0."""
         times, shifts, turns = self._arrays()
         time = time % times[-1] if self.repeat else min(time, times[-1])
         after = int(np.clip(np.searchsorted(times, time, side="right"), 1, len(times) - 1))

@@ -223,7 +223,7 @@ def _body_problems(
     if (ends + own).max(initial=0) >= tets:
         yield f"arm_tets has the index {(ends + own).max()}, but there are {tets} tetrahedra"
     if not np.array_equal(np.sort(arrays["order"].stored), np.arange(nodes)):
-        yield "order does not have each node once"
+        yield "order does not contain each node exactly once"
     if (arrays["parents"].stored >= np.maximum(np.arange(nodes), 1)[:, None]).any():
         yield "parents has a position that is not before its own"
     if not np.all(arrays["weights"].step == WEIGHT_STEP):

@@ -1,4 +1,4 @@
-"""Positions of the nodes of a cage over time, predicted and stored as residuals (docs/concepts/bundle.md)."""
+"""Positions of the nodes of a cage over time, stored as residuals of a prediction (docs/concepts/bundle.md)."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ double precision and every reader rounds it to the same number."""
 _WEIGHT_ZERO = 128
 """Stored number of a weight of 0."""
 _LEVELS = 65535
-"""Number of steps along the space diagonal of the body at rest, times the square root of 3."""
+"""Number of quantisation steps along the space diagonal of the body at rest, divided by the square root of 3."""
 _FIT_ROUNDS = 5
 """Rounds of reweighted least squares with which the weights are fitted."""
 _SMALL_RESIDUAL = 2.0
-"""Residual, in steps, below which all residuals count alike in the fit."""
+"""Residual, in steps, below which the loss of the fit is quadratic instead of absolute."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class TrackPredictor:
     order: np.ndarray
     """(N,) int64, node at each position of the order."""
     parents: np.ndarray
-    """(N, PARENTS) int64, positions in the order from which a position is predicted, smaller than its own; 0 beside a
-    weight of 0."""
+    """(N, PARENTS) int64, positions in the order from which a position is predicted, smaller than its own; 0 where
+    the weight is 0."""
     weights: np.ndarray
     """(N, PARENTS) float64, multiples of 1/64."""
 
@@ -41,9 +41,9 @@ class TrackPredictor:
     def fitted(cls, rest: np.ndarray, displacements: np.ndarray) -> TrackPredictor:
         """Return a predictor that makes the residuals small.
 
-        The order starts with the node next to the centre, and each further node is the one farthest from those before
-        it, so that most nodes lie between their parents. The parents are the nearest nodes before a node. Its weights
-        approximately minimise the sum of the absolute residuals.
+        The order starts with the node nearest to the centre, and each further node is the one farthest from those
+        before it, so that most nodes lie between their parents. The parents are the nearest nodes before a node. Its
+        weights approximately minimise the sum of the absolute residuals.
 
         Args:
             rest: (N, 3) rest positions.
@@ -57,7 +57,7 @@ class TrackPredictor:
             distances = np.sum((points[:k] - points[k]) ** 2, axis=1)
             nearest = np.argsort(distances, kind="stable")[:PARENTS]
             parents[k, : len(nearest)] = nearest
-            # Relative to the nearest parent, so that the weights have a sum of 1 and travel leaves no residual.
+            # Relative to the nearest parent, so that the weights sum to 1 and a translation leaves no residual.
             relative = ordered[:, nearest] - ordered[:, nearest[:1]]
             target = ordered[:, k] - ordered[:, nearest[0]]
             weights[k, : len(nearest)] = _whole_weights(relative.transpose(0, 2, 1).reshape(target.size, -1), target)
@@ -112,11 +112,11 @@ class NodeTrack:
     step: float
     """Quantisation step of the positions."""
     error: float
-    """Largest distance of a node from its position before quantisation; at most half the diagonal of the body at rest,
-    divided by 65,535."""
+    """Largest distance between the quantised and the original position of a node; at most half the diagonal of the body
+    at rest, divided by 65,535."""
     predictor: TrackPredictor
     displacements: np.ndarray
-    """(F, N, 3) int64, displacements from the frame before, in the first frame from rest, in steps."""
+    """(F, N, 3) int64, displacements in steps from the frame before, and in the first frame from the rest pose."""
 
     @classmethod
     def fitted(cls, rest: np.ndarray, nodes: np.ndarray) -> NodeTrack:
@@ -135,7 +135,8 @@ def whole_steps(positions: np.ndarray, step: float) -> np.ndarray:
 
 
 def _farthest_first(points: np.ndarray) -> np.ndarray:
-    """Return an order (N,) of ``points``: the one next to their mean, then always the farthest from those before."""
+    """Return an order (N,) of ``points``: first the one nearest to their mean, then always the one
+    farthest from those before."""
     distances = np.sum((points - points.mean(axis=0)) ** 2, axis=1)
     order = np.empty(len(points), np.int64)
     order[0] = np.argmin(distances)
@@ -149,14 +150,15 @@ def _farthest_first(points: np.ndarray) -> np.ndarray:
 
 
 def _whole_weights(features: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return weights (p,) with a sum of 1 that approximately minimise the sum of |target - features w|.
+    """Return weights (p,) that sum to 1 and approximately minimise the sum of |target - features w|.
 
     Args:
         features: (m, p) displacements of the parents relative to the first one.
         target: (f, 3) displacements relative to the first parent, with 3 f = m.
 
     Returns:
-        Multiples of 1/64 between -2 and 127/64; 1 and zeros if the fit exceeds these limits.
+        Multiples of 1/64 between -2 and 127/64. If the fit exceeds these limits, the first weight is 1 and the
+        others are 0.
     """
     others = _least_deviations(features[:, 1:], target.reshape(-1))
     stored = np.rint(others / WEIGHT_STEP)
@@ -173,7 +175,7 @@ def _least_deviations(features: np.ndarray, values: np.ndarray) -> np.ndarray:
         return weights
     for _ in range(_FIT_ROUNDS):
         matrix = features.T @ (share[:, None] * features)
-        # The regularisation keeps weights of nodes small that move alike.
+        # The regularisation keeps the weights of nodes that move alike small.
         matrix[np.diag_indices_from(matrix)] += 1e-6 * np.mean(np.diag(matrix)) + 1e-3
         weights = np.linalg.solve(matrix, features.T @ (share * values))
         share = 1.0 / np.maximum(np.abs(values - features @ weights), _SMALL_RESIDUAL)

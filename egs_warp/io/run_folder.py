@@ -26,7 +26,7 @@ MANIFEST = "manifest.json"
 CONFIG = "run.yaml"
 """Name of the file with the flags of a run, from which the command resumes the run."""
 ANIMATE, ANIMATE_WORLD = "animate", "animate world"
-"""Names in the manifest of the commands whose runs can be resumed: for a single capture, and for a world."""
+"""Names in the manifest of the commands whose runs can be resumed: ``animate`` for a single capture and for a world."""
 RESUMABLE = (ANIMATE, ANIMATE_WORLD)
 _LOCK = ".egs-run.lock"
 _SCHEMA = 1

@@ -1,4 +1,4 @@
-"""Triangle meshes in binary glTF 2.0: named parts without materials."""
+"""Triangle meshes in binary glTF 2.0 files: named parts without materials."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _meshes(tree: Mapping[str, Any], binary: bytes, source: Path) -> list[Triang
         entry = tree["accessors"][number]
         if "sparse" in entry or "bufferView" not in entry:
             raise UserError(
-                f"{source}: accessor {number} is sparse or compressed, which is not read; export it plainly"
+                f"{source}: accessor {number} is sparse or compressed, which is not supported; export it uncompressed"
             )
         view = tree["bufferViews"][entry["bufferView"]]
         kind = "<f4" if entry["componentType"] == _FLOAT else _INDEX_TYPES[entry["componentType"]]

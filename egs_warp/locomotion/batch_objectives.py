@@ -54,7 +54,8 @@ class BatchObjectives(BatchedRecord):
 
     @classmethod
     def merged(cls, parts: Sequence[tuple[torch.Tensor, BatchObjectives]], count: int) -> BatchObjectives:
-        """Return the objectives of ``count`` worlds; each part has those of some worlds, whose numbers come first."""
+        """Return the objectives of ``count`` worlds; each of the ``parts`` has the indices (k,) of some worlds and
+        their objectives."""
         first_rows, first = parts[0]
         if len(first_rows) == count:
             return first

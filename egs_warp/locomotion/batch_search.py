@@ -30,6 +30,7 @@ from egs_warp.locomotion.device_search import (
 )
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import RESTART_COST, RESTART_GAP
+from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.precision import Vec3, real
 
 POOL, RELAXATION_POOL = 512, 256
@@ -171,8 +172,10 @@ class BatchModeSearch:
         result = packed.new_zeros(len(packed), HEADER_SIZE + self._m + 3 * self._capacity)
         unused = torch.zeros((len(packed), 1), dtype=torch.int32, device=packed.device)
         self._first.run(as_warp(packed, real), as_warp(result, real), as_warp(unused, wp.int32))
-        for world in nonzero(result[:, _STATUS] == NUMERICAL_FAILURE).tolist():
-            self._search_on_host(packed[world], result[world])
+        # With many threads, BLAS takes ten times as long for matrices of this size.
+        with one_blas_thread():
+            for world in nonzero(result[:, _STATUS] == NUMERICAL_FAILURE).tolist():
+                self._search_on_host(packed[world], result[world])
         return result
 
     def _search_on_host(self, packed: torch.Tensor, result: torch.Tensor) -> None:
@@ -197,11 +200,12 @@ class BatchModeSearch:
         result = packed.new_zeros(len(packed), HEADER_SIZE + self._m)
         self._relaxed.run(as_warp(packed, real), as_warp(result, real))
         is_known = result[:, _STATUS] == OPTIMUM_FOUND
-        for world in nonzero(~is_known).tolist():
-            relaxed = solve_relaxed(parse_packed_qp(packed[world].cpu().numpy())[0], QpSolver.OSQP)
-            if relaxed is not None:
-                result[world, HEADER_SIZE:], result[world, 1] = torch.from_numpy(relaxed[0]), relaxed[1]
-                is_known[world] = True
+        with one_blas_thread():
+            for world in nonzero(~is_known).tolist():
+                relaxed = solve_relaxed(parse_packed_qp(packed[world].cpu().numpy())[0], QpSolver.OSQP)
+                if relaxed is not None:
+                    result[world, HEADER_SIZE:], result[world, 1] = torch.from_numpy(relaxed[0]), relaxed[1]
+                    is_known[world] = True
         return result[:, HEADER_SIZE:], result[:, 1], is_known
 
     def _search_from(self, program: BatchProgram, activations: torch.Tensor) -> torch.Tensor:

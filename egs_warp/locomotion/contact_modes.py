@@ -312,8 +312,8 @@ def forces_in_modes(rows: np.ndarray, offset: np.ndarray, friction: float, modes
     column. They keep sticking contacts at rest and sliding contacts closed.
 
     Args:
-        rows: (3n, m + 3n) derivative of the contact velocities with respect to the m unknowns, then the forces.
-        offset: (3n,) contact velocities at zero.
+        rows: (3n, m + 3n) derivative of the contact velocities with respect to the m other unknowns and the forces.
+        offset: (3n,) contact velocities if all unknowns are zero.
         friction: Coulomb coefficient.
         modes: modes of the n contacts.
 

@@ -62,7 +62,7 @@ class DeviceRestart:
         Args:
             result: result of the first search.
             contacts: number of contacts.
-            run: function that runs queued work, as a CUDA graph.
+            run: function that runs what its argument queues, as a CUDA graph.
             is_done: True if ``enqueue_restart`` has run concurrently with the first search.
         """
         if not needs_restart(result.objective, contacts):

@@ -148,11 +148,12 @@ def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.nda
 
 
 def strain_modes(second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rates of stretch and shear of a body as affine velocity fields A_r arm, orthonormal in the
-    mass-weighted mean and orthogonal to rotations. "..." is the world axis, or nothing for one world.
+    """Return the rates of stretch and shear of a body as linear velocity fields A_r a, where the arm a of a node is its
+    position relative to the centre of mass. The fields are orthonormal in the mass-weighted mean and orthogonal to
+    rotations. "..." is the world axis, or nothing for one world.
 
     Args:
-        second: (..., 3, 3) m^2, mass-weighted mean of the products of the arms of the nodes.
+        second: (..., 3, 3) m^2, mass-weighted mean of the products a_i a_j of the arms.
 
     Returns:
         The matrices A_r (..., 6, 3, 3) 1/m, and (..., 6) bool, True for independent modes; a flat body has fewer.
@@ -161,7 +162,7 @@ def strain_modes(second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     roots = np.sqrt(np.maximum(moments, 0.0))[..., None, :]
     floor = _MIN_MODE * roots.max(axis=-1, keepdims=True)
     inverse = np.where(roots > floor, 1.0 / np.maximum(roots, floor), 0.0)
-    # In the coordinates A half, with half half^T = second, the mean of (A arm) (B arm) is the sum of A_ij B_ij.
+    # With C = A half and D = B half, half half^T = second, the mean of (A a) . (B a) is the sum of C_ij D_ij.
     coordinates = (_LINEAR_MODES @ (axes * roots)[..., None, :, :]).reshape(*second.shape[:-2], 9, 9)
     orthonormal, triangle = np.linalg.qr(coordinates.swapaxes(-1, -2))
     sizes = np.abs(np.diagonal(triangle, axis1=-2, axis2=-1))
@@ -181,7 +182,7 @@ def _linear_modes() -> np.ndarray:
 
 
 _LINEAR_MODES, _MIN_MODE = _linear_modes(), 1e-6
-"""Rotations and strains; minimum ratio of an independent strain mode to the largest one."""
+"""Rotations and strains; minimum norm of an independent strain mode relative to the largest one."""
 
 
 @dataclass(frozen=True)

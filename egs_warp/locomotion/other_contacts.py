@@ -1,7 +1,7 @@
 """Contacts of an island that the planned body does not touch, eliminated from its QP.
 
 These contacts keep their predicted modes in the plan, so their forces are an affine function of the other unknowns:
-the other bodies yield to the planned body as far as their own contacts let them. The solve of the step computes the
+the other bodies yield to the planned body as far as their own contacts permit. The solve of the step computes the
 forces of all contacts again from Coulomb's law.
 """
 
@@ -35,7 +35,7 @@ class OtherContacts:
         Args:
             retained: indices of the contacts of the planned body.
             rows: (3n, m + 3n) derivative of all contact velocities with respect to the unknowns.
-            offset: (3n,) contact velocities at zero.
+            offset: (3n,) contact velocities if all unknowns are zero.
             friction: Coulomb coefficient.
             forces: (n, 3) predicted contact forces, which determine the modes.
 

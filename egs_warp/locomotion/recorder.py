@@ -69,8 +69,8 @@ class Recorder:
         Args:
             reports: their reports, in order.
             request_digest: ``replay.digest`` of the objectives and of ``kick``; only read when a run is continued.
-            kick: (N, 3) m/s, velocities that external pushes added to the nodes at the start of the step. The drives
-                of the reports are recorded as kicks, too.
+            kick: (N, 3) m/s, velocities that external pushes added to the nodes at the start of the step. The
+                velocities that drives added, which the reports contain, are recorded as kicks, too.
         """
         if kick is not None:
             self._kicks.append((self._steps + len(self._reports), kick))

@@ -1,4 +1,4 @@
-"""Objectives of a step as a few numbers of each world, from which a kernel makes their rows.
+"""Objectives of a step as a few numbers of each world, from which a kernel computes their rows.
 
 In the shapes below, "..." is the world axis, or nothing for one world.
 """
@@ -95,7 +95,8 @@ class ReducedObjectives(BatchedRecord):
     """(...,) its weight."""
 
     def of_one_world(self, shares: np.ndarray, positions: np.ndarray) -> list[AnyObjective]:
-        """Return the objectives of a record of one world, without those of zero weight.
+        """Return the objectives of a record of one world. Objectives on the end velocity with zero weight are left out,
+        except that on the centre of mass.
 
         Args:
             shares: (P, N) weights of the nodes in each part.
@@ -138,8 +139,8 @@ def strain_objectives(parts: int, second: np.ndarray, target: np.ndarray, weight
 
     Args:
         parts: number of parts P.
-        second: (..., 3, 3) m^2, mean of the products of the arms of the nodes.
-        target: (..., 3, 3) m^2/s, mean of the products of the target velocities and the arms.
+        second: (..., 3, 3) m^2, mass-weighted mean of the products a_i a_j of the arms (``strain_modes``).
+        target: (..., 3, 3) m^2/s, mass-weighted mean of the products v_i a_j of the target velocities and the arms.
         weight: (...,) weight.
     """
     modes, is_independent = strain_modes(second)

@@ -75,7 +75,8 @@ def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]
 
 def support_report(stepper: LocomotionStepper, report: StepReport) -> StepReport:
     """Return the ``report`` of a body among others with only the contacts that support the body: those with the ground,
-    and those with other bodies below it. A motion must not treat a body that pushes it from the side as its ground."""
+    and those with other bodies below it. A motion must not treat another body that pushes from the side as its ground.
+    """
     contacts, up = report.contacts, -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
     kept = (contacts.faces >= 0) | (contacts.axes[:, 0] @ up > _MIN_SUPPORT_COSINE)
     contacts = replace(contacts, **{name: value[kept] for name, value in contacts.batched_fields()})

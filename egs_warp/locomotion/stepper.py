@@ -95,7 +95,7 @@ class StepReport(BatchedRecord):
     added_spin: float
     """Magnitude of ``ImplicitStep.momentum_correction``, rad/s."""
     drive: np.ndarray | None = None
-    """(N, 3) m/s, changes of velocity by the drive of a body that follows a path (``DrivenStep``); None for others."""
+    """(N, 3) m/s, velocities added by the drive of a body that follows a path (``DrivenStep``); None for others."""
     milliseconds: dict[str, float] = field(default_factory=dict)
     """Wall-clock time of each stage, ms."""
 

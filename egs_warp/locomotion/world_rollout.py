@@ -52,7 +52,7 @@ def roll_out_world(
             objectives = [run.objectives(dt) for run in runs]
             begun = [run.begin_step(each, dt) for run, each in zip(runs, objectives, strict=True)]
             done = [reports for _, reports in begun]
-            # The parts of the bodies are written one after the other, so that some may miss the last steps of others.
+            # The bodies are recorded one after the other, so an interrupted run may lack the last steps of some bodies.
             if all(done):
                 stepper.observe(done)
             else:

@@ -172,8 +172,8 @@ class WorldStepper:
         )
 
     def observe(self, done: Sequence[Sequence[StepReport]]) -> None:
-        """Count the steps for which each prop has been at rest, after a step of all bodies with the reports ``done``
-        that ``advance`` has returned, possibly in an earlier process."""
+        """Count the steps for which each prop has been at rest, after a step of all bodies. ``done`` are the reports
+        that ``advance`` returned for this step, possibly in an earlier process."""
         for body, reports in enumerate(done):
             last, soft_body = reports[-1], self.bodies[body].stepper.body
             is_prop = self.bodies[body].stepper.muscles.segment_count == 0

@@ -1,4 +1,4 @@
-"""Objectives of the soles of bodies in the air: move to their places in the landing pose, and turn a base flat."""
+"""Objectives that move the soles of airborne bodies to their positions in the landing pose and turn a base flat."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ _BASE = 1
 
 @dataclass(frozen=True)
 class AirborneSoles(BatchedRecord):
-    """Soles of bodies in the air and the weights of their objectives. There is one sole for each foot on a leg, or the
-    base alone. "..." is the world axis, or nothing for one world."""
+    """Weights of the objectives of the S soles of bodies in the air. The first sole is the whole base, whose weights
+    are zero for a body on legs; the soles of its feet follow. "..." is the world axis, or nothing for one world."""
 
     swing_weight: np.ndarray
     """(..., S) weights of the velocities of the base and of the soles of the feet."""
@@ -93,7 +93,7 @@ class AirborneSoles(BatchedRecord):
         spin = times(level, np.cross(now, target)) * rate[..., None]
         trace = np.trace(second, axis1=-2, axis2=-1)
         radius = np.sqrt(trace)[..., None]
-        # A flat base has no inverse inertia about some axis; its weight is zero.
+        # The inertia of a base that spans no area may be singular; the weight of its tilt rate is zero.
         has_tilt = (self.tilt_weight > 0.0)[..., None, None]
         inertia = np.where(has_tilt, trace[..., None, None] * np.eye(3) - second, np.eye(3))
         turning = radius[..., None] * (level @ np.linalg.inv(inertia))

@@ -93,7 +93,7 @@ class Measurement(BatchedRecord):
 
 @dataclass(frozen=True)
 class Balance(BatchedRecord):
-    """Mathematics of the balance controllers of one world or many: measurement, target poses and target velocities.
+    """Balance controllers of one world or many: measurement, target poses and target velocities.
 
     Target poses are affine maps of the rest shape: stretch along the up axis, bulging across it, and shear or bending
     by the lean.

@@ -43,8 +43,9 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
 
     Candidates for the head are branches of the skeleton that end near the top. A candidate consists of the sections
     above its highest neck and the branches that start there; a small branch without a neck is a candidate as a whole.
-    A candidate beside which the body ends higher, with a heavier top, is a raised arm or what it holds. The head is the
-    candidate with the largest mass. A neck is a section between clearly thicker sections above and below.
+    A candidate is a raised arm, or an object that an arm holds, if the rest of the body ends higher and has a heavier
+    top. The head is the other candidate with the largest mass. A neck is a section between clearly thicker sections
+    above and below.
 
     Args:
         mesh: cage at rest, m.
@@ -81,7 +82,7 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
 
 
 def _is_raised_arm(part: np.ndarray, heights: np.ndarray, node_mass: np.ndarray) -> bool:
-    """True if the rest of the body ends higher than a ``part`` (k,) of its nodes, and its top is heavier."""
+    """Return True if the rest of the body ends higher than a ``part`` (k,) of its nodes, and has a heavier top."""
     rest = np.setdiff1d(np.arange(len(heights)), part)
     depth = _TOP_DEPTH * float(np.ptp(heights))
     tops = [nodes[heights[nodes] > heights[nodes].max() - depth] for nodes in (part, rest)]

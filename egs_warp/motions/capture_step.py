@@ -32,9 +32,9 @@ HOP_HEIGHT = 0.08
 _HOP_STYLE = {"anticipation": 0.5, "timing": 0.5}
 """Factors on the style of a capture hop: a short crouch and a quick thrust."""
 _MIN_COM_HEIGHT = 0.15
-"""Lower bound of the height of the centre of mass in the capture point, in body heights."""
+"""Lower bound of the height of the centre of mass in the formula of the capture point, in body heights."""
 MIN_DISTANCE, MAX_DISTANCE = 0.05, 0.8
-"""Minimum and maximum length of a capture step, in body heights."""
+"""Minimum and maximum length of a capture step or hop, in body heights."""
 
 
 def capture_motion(
@@ -75,8 +75,9 @@ def capture_motion(
 
 
 def _hop(stance: Stance, moved: Stance, fall: FallingPendulum, centre: np.ndarray) -> Jump:
-    """Return the hop of the body that stands at ``moved``, whose feet land under the capture point. ``fall`` and the
-    place of the centre of mass over the present feet, ``centre`` (2,), are in the ground frame of ``stance``."""
+    """Return the hop of the body that stands at ``moved``, whose feet land under the capture point. ``fall`` and
+    ``centre`` (2,) m, the standing position of the centre of mass over the present feet, are in the ground frame of
+    ``stance``."""
     body, gravity = moved.body, float(np.linalg.norm(moved.body.gravity))
     moved = replace(moved, style=moved.style.scaled(_HOP_STYLE))
     height = HOP_HEIGHT * body.height
@@ -89,8 +90,8 @@ def _hop(stance: Stance, moved: Stance, fall: FallingPendulum, centre: np.ndarra
 
 
 def _step(stance: Stance, moved: Stance, fall: FallingPendulum, centre: np.ndarray, report: StepReport) -> Walk:
-    """Return the walk of the body that stands at ``moved``, whose feet step under the capture point, those with the
-    smallest load first. ``fall`` and ``centre`` (2,) are those of ``_hop``."""
+    """Return the walk of the body that stands at ``moved``, whose feet step under the capture point; those with the
+    smallest load step first. ``fall`` and ``centre`` (2,) are those of ``_hop``."""
     body = moved.body
     time_unit = float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
     landed = fall.capture_at(LEGGED_TIMING.swing_time * time_unit / STEP_SPEED)

@@ -60,7 +60,7 @@ def spin_for_rotation(
     target = rotations_of(turn) @ rotations_of(upright)
     steady = (upright + turn) / np.asarray(seconds)[..., None]
     sizes = _DIFFERENCE * np.maximum(np.linalg.norm(steady, axis=-1, keepdims=True), 1.0)
-    # The first of the four rotations is that of the spin itself; the others are those of its difference quotients.
+    # The first of the four rotations is that of the spin itself; the others are for the difference quotients.
     offsets = np.concatenate([np.zeros((1, 3)), np.eye(3)]).reshape(4, *np.ones(steady.ndim - 1, int), 3) * sizes
     spin = steady
     missing = np.full_like(steady, np.inf)

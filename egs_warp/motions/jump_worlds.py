@@ -149,7 +149,6 @@ class JumpWorlds(MotionWorlds):
         heading.update(measurement.heading + np.where(self.is_airborne, heading.target, 0.0))
         self._advance_phase(measurement, state.time, dt)
         elapsed = state.time - self.entered + dt
-        # A step before take-off has no soles in its objectives.
         targets, methods = None, (self._crouch, self._crouch, self._thrust, self._fly, self._land, self._land)
         for phase in np.unique(self.phase):
             rows = np.flatnonzero(self.phase == phase)
@@ -202,8 +201,8 @@ class JumpWorlds(MotionWorlds):
 
     def _take_off(self, rows: np.ndarray) -> None:
         """Change to the frame of the landing in the worlds ``rows`` (k,)."""
-        # Poses are stored relative to the standing pose. The landing frame is rotated against the take-off frame, so
-        # rotate the stored poses into it.
+        # Poses are stored relative to the standing pose. The landing frame is rotated relative to the take-off frame,
+        # so rotate the stored poses into it.
         up = self.current.axes[rows, 2]
         back = rotations_of(-self.heading.target[rows, None] * up)
         self.last_pose[rows], self.pose_before[rows] = self.last_pose[rows] @ back, self.pose_before[rows] @ back
@@ -443,6 +442,7 @@ class JumpWorlds(MotionWorlds):
             follow=follow,
             weights=weights,
         )
+        # Only bodies in the air have objectives on their soles.
         rows = np.flatnonzero(flies)
         if len(rows) == 0:
             return objectives

@@ -1,5 +1,5 @@
-"""Kick: a jump past another body whose path is so close that the base of the jumper strikes its upper part and knocks
-it over (docs/guide/worlds.md)."""
+"""Kick: a jump that passes so close to another body that the base of the jumper strikes the upper part of the body and
+knocks it over (docs/guide/worlds.md)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from egs_warp.motions.sequence import JudgedOutcome, Stance, TargetError
 
 _OVERLAP = 0.8
 """Distance from the path to the middle of the other body, relative to the distance at which its top and the base of the
-jumper would just touch. A path through the middle carries the body along and the jumper lands on it."""
+jumper would just touch. On a path through the middle, the jumper carries the body along and lands on it."""
 _TOP = 0.6
 """Fraction of the height of the other body above which its points are its upper part."""
 _HIT_TILT, _HIT_DISTANCE = 5.0, 0.02

@@ -1,8 +1,8 @@
 """Motions of many worlds of one body on a device.
 
-Jumps, hops and twists are computed for all worlds at once: the device reduces each state to some hundred
-numbers, one transfer brings them to the host, the state machines run with a world axis (``MotionWorlds``), and a kernel
-makes the rows of the objectives. Other motions are evaluated one world after the other.
+Jumps, hops and twists are computed for all worlds at once: the device reduces each state to its moments and contacts
+(``ReducedState``), one transfer copies them to the host, the state machines run with a world axis (``MotionWorlds``),
+and a kernel computes the rows of the objectives. Other motions are evaluated one world after the other.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class _Group:
         """Return the ``objectives`` with their rows, for centres of mass (k, 3) m and ``positions`` (k, N, 3) m."""
         device, affine = positions.device, objectives.affine
         count, rows = affine.targets.shape
-        # One transfer for all numbers.
+        # Transfer all numbers at once.
         values = [affine.coefficients, affine.targets, affine.weights, objectives.momentum]
         flat = np.concatenate([each.reshape(count, -1) for each in values], axis=1)
         momentum_weights = objectives.momentum_weight[:, None]

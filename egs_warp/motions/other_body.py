@@ -1,4 +1,4 @@
-"""Another body of a world, as the motions of a creature see it: its outline on the ground and its current state."""
+"""Another body of a world, as input of the motions of a creature: its current state, extent and tilt."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class OtherBody:
     state: Callable[[], BodyState]
     """Function that returns its current state."""
     geometry: ContactGeometry
-    """Contact points, which give the extent of a prop; its one tetrahedron is larger than the object."""
+    """Contact points, which give the extent of a prop; its single tetrahedron is larger than the object."""
 
     def points(self) -> np.ndarray:
         """Return the contact points (P, 3) m in the frame of the world."""

@@ -174,8 +174,8 @@ class Stand(JoinedMotion[StandWorlds]):
 
 
 class StandFor:
-    """Stand for ``seconds`` s, and then until the body is at rest. A body that loses its balance takes a capture step
-    (``egs_warp.motions.capture_step``)."""
+    """Stand for ``seconds`` s, and then until the body is at rest. A body that loses its balance takes up to
+    ``MAX_CAPTURE_STEPS`` capture steps (``egs_warp.motions.capture_step``)."""
 
     def __init__(self, stance: Stance, seconds: float) -> None:
         self.seconds, self._stand, self._stance = seconds, Stand(stance), stance
@@ -183,7 +183,7 @@ class StandFor:
         self._is_over = False
         self._step: Walk | Jump | None = None
         self.step_count = 0
-        """Number of capture steps so far."""
+        """Number of capture steps so far. Each is a walk, which may have several steps, or a hop."""
 
     @property
     def is_at_rest(self) -> bool:
@@ -218,7 +218,7 @@ class StandFor:
     def notes(self) -> list[str]:
         """Return a message for the user about capture steps."""
         count = self.step_count
-        return [f"took {count} step{'s' * (count > 1)} to keep its balance"] if count else []
+        return [f"took {count} capture step{'s' * (count > 1)} to keep its balance"] if count else []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of

@@ -1,4 +1,4 @@
-"""Walks that are steered at every time step towards, after or away from other bodies, around bodies and obstacles.
+"""Walks that are steered at every time step towards, after or away from other bodies, and avoid bodies and obstacles.
 
 Positions are metres in the ground frame in which the motion starts: forward and to the left. The direction is chosen
 among samples by the predicted clearance (the dynamic window approach of Fox, Burgard and Thrun, 1997).
@@ -47,7 +47,7 @@ _MEMORY = 1.5
 
 @dataclass(frozen=True)
 class View:
-    """The body and its neighbours at one time."""
+    """Time, position and heading of the body."""
 
     time: float
     """Time since the start of the motion, s."""
@@ -131,10 +131,10 @@ def free_direction(
         times = relative @ offset / np.maximum((relative**2).sum(axis=1), 1e-12)
         times = np.clip(times, 0.0, min(horizon, left / speed))
         nearest = np.linalg.norm(offset - times[:, None] * relative, axis=1)
-        # A body that is already too close counts only as far as it comes closer.
+        # If a body is already too close, only a further approach has a cost.
         required = min(apart, float(np.linalg.norm(offset)))
         costs += _DEFICIT_COST * np.maximum(required - nearest, 0.0) / height
-    # The cost of an obstacle is only needed for directions that could be the best.
+    # Compute the cost of obstacles only for directions that can still be the best.
     for index in np.argsort(costs, kind="stable"):
         obstacle = _obstacle_cost(position, directions[index], min(_LOOKAHEAD * height, left), blocked)
         costs[index] += obstacle
@@ -284,7 +284,7 @@ def steering_command(heading: float, direction: np.ndarray) -> Drive:
 
 
 def is_blocked(stance: Stance, point: np.ndarray, radius: float) -> bool:
-    """Return True if a step in the ground is closer than ``radius`` m to ``point`` (2,) m, ground frame of
+    """Return True if a step up or down in the ground is within ``radius`` m of ``point`` (2,) m, ground frame of
     ``stance``."""
     ground = stance.ground
     normal = ground.axes @ ground.surface_normal

@@ -1,4 +1,4 @@
-"""Targets of steered walks: up to a body, after it, away from it, and pushing it to a place."""
+"""Targets of steered walks: reach a point or a body, follow a body, keep away from it, or push it to a place."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _AIM_DISTANCE = 0.6
 the target."""
 _MAX_STEER = np.radians(35.0)
 _MAX_OFFSET = 0.5
-"""Sideways distance from this line, relative to the distance at which the bodies touch, from which a push begins again
-behind the body."""
+"""Sideways distance of the pushing body from the line through the pushed body to its goal, relative to the distance at
+which the bodies touch, above which a push begins again behind the body."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class WalkToPoint:
 
 
 class WalkToBody:
-    """Walk towards a body, also if it moves, and stop at a gap from it."""
+    """Walk towards a body, even if it moves, and stop at a gap from it."""
 
     def __init__(self, stance: Stance, other: OtherBody, name: str, gap: float) -> None:
         """Create the target; ``gap`` is the distance in metres between the bodies at which the walk ends."""
@@ -98,7 +98,7 @@ class FollowBody:
         return float(np.linalg.norm(centre - view.position)) - self._touching - self._gap
 
     def goal(self, view: View) -> np.ndarray | None:
-        """Return the position of the other body; None if it is close."""
+        """Return the position of the other body; None if the gap to it is small enough."""
         near = _ARRIVED * self._stance.body.height
         return self._other.centre(self._stance) if self._left(view) > near else None
 
@@ -130,7 +130,7 @@ class AvoidBody:
         return float(np.linalg.norm(centre - view.position)) - self._touching
 
     def goal(self, view: View) -> np.ndarray | None:
-        """Return a point away from the other body; None if it is far."""
+        """Return a point away from the other body; None if the gap to it is large enough."""
         self._minimum = min(self._minimum, self._apart(view))
         if self._apart(view) > self._gap:
             return None
@@ -146,8 +146,8 @@ class AvoidBody:
         return ()
 
     def failures(self, view: View) -> tuple[str, ...]:
-        """Return a text if the other body came too close."""
-        return (f"{self._name} touched it",) if self._minimum < 0.0 else ()
+        """Describe the failure if the bodies touched."""
+        return (f"{self._name} was touched",) if self._minimum < 0.0 else ()
 
 
 class PushTo:
@@ -162,7 +162,7 @@ class PushTo:
         self._is_pushing = False
 
     def goal(self, view: View) -> np.ndarray:
-        """Return the point to walk to: first behind the body, then through it."""
+        """Return the point to walk to: first behind the body, then ahead along the line of the push."""
         centre, along = self._line()
         height = self._stance.body.height
         extent = float(((centre - self._stance.ground.local(self._other.points())[:, :2]) @ along).max())
@@ -192,7 +192,7 @@ class PushTo:
         return left < _ARRIVED * self._stance.body.height
 
     def ignored(self) -> Sequence[str] | None:
-        """Return None while it pushes: it walks straight, also if there is a ramp under the body."""
+        """Return None during a push: the body walks straight to the goal, even up a ramp under the pushed body."""
         return None if self._is_pushing else ()
 
     def failures(self, view: View) -> tuple[str, ...]:

@@ -40,7 +40,7 @@ class SupportPolygon(BatchedRecord):
 
         Args:
             points: (..., n, 2) m.
-            counts: (...,) number of points of each world, the first of its row; None for all.
+            counts: (...,) number of points of each world, at the start of its row; None uses all points.
         """
         worlds, count = points.shape[:-2], points.shape[-2]
         space = _hull_workspace(int(np.prod(worlds)), count)
@@ -164,7 +164,7 @@ class _HullWorkspace:
 
 
 class _HullWorkspaces(threading.local):
-    """Last workspaces of a thread by numbers of worlds and points."""
+    """Most recently used workspaces of a thread, by numbers of worlds and points."""
 
     def __init__(self) -> None:
         self.by_size: OrderedDict[tuple[int, int], _HullWorkspace] = OrderedDict()
@@ -176,8 +176,8 @@ _MAX_WORKSPACES = 8
 
 
 def _hull_workspace(worlds: int, points: int) -> _HullWorkspace:
-    """Return a workspace for the hulls of at most ``points`` points in each of the ``worlds``. A launch from the same
-    memory as before takes a third of the time of one from new arrays."""
+    """Return a workspace for the hulls of at most ``points`` points in each of the ``worlds``. A launch on the arrays
+    of an earlier launch takes a third of the time of a launch on new arrays."""
     key = worlds, round_up(points, 16)
     space = _workspaces.by_size.pop(key, None) or _HullWorkspace(*key)
     _workspaces.by_size[key] = space

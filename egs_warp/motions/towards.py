@@ -1,7 +1,7 @@
 """Motions towards other bodies of a world, such as ``face NAME``, ``kick NAME`` and ``push NAME to X,Y``.
 
 ``face``, ``jump to`` and ``kick`` are computed from the position of the other body when they start. The walks are
-steered while they run: they follow a body that moves, and walk round other bodies and obstacles.
+steered while they run: they follow a body that moves, and avoid other bodies and obstacles.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ TOWARDS: Mapping[str, tuple[Value, ...]] = {
 
 @dataclass(frozen=True)
 class _Piece:
-    """One motion towards a body, parsed."""
+    """Parsed motion towards a body."""
 
     kind: str
     name: str
@@ -149,7 +149,7 @@ def _values(kind: str, parameters: tuple[Value, ...], words: list[str], where: s
     given: dict[str, float] = {}
     for word in words:
         if re.fullmatch(r"[xX]\d+", word):
-            raise UserError(f"{where}: it cannot be repeated; write it once more")
+            raise UserError(f"{where}: {kind} cannot be repeated with {word}; write the motion again")
         key, equals, number = word.partition("=")
         free = [name for name in known if name not in given]
         key, number = (key, number) if equals else (free[0] if free else "", word)
@@ -191,7 +191,7 @@ def _in_frame(place: np.ndarray, stance: Stance) -> np.ndarray:
 def _among(
     requests: tuple[MotionRequest, ...], others: Mapping[str, OtherBody], stance: Stance
 ) -> tuple[MotionRequest, ...]:
-    """Return the requests of a creature among ``others``: a walk to a point is steered round them."""
+    """Return the requests of a creature among ``others``: a walk to a point is steered around them."""
     if not others:
         return requests
     return tuple(
@@ -213,8 +213,8 @@ def _begin_walk(request: MotionRequest, others: Mapping[str, OtherBody], stance:
 
 
 def _begin(piece: _Piece, others: Mapping[str, OtherBody], asked: dict[str, float], stance: Stance) -> BodyMotion:
-    """Begin a motion towards a body and store its target in ``asked``, by which the result is judged. A jump has no
-    such target, because the other body may stop it."""
+    """Begin a motion towards a body. The target of ``face`` is stored in ``asked``, and the result is judged by it. A
+    jump has no such target, because the other body may stop it."""
     other, values = others[piece.name], piece.values
     height, name = stance.body.height, piece.name
     centre, _ = other.place(stance)

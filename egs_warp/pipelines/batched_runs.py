@@ -208,7 +208,7 @@ def _run(creature: Creature, batch: Sequence[_BatchJob], progress: Progress) -> 
 
 def _prepare_motions(runs: Sequence[_Run], done: Sequence[list[StepReport]]) -> None:
     """Compute the next objectives of the motions that have a world axis; ``done`` are the reports of the steps of each
-    run. The runs then ask their motions for these objectives."""
+    run. The motions return these objectives when the runs call them."""
     groups: dict[tuple[type, int], list[tuple[JoinedMotion[Any], StepReport]]] = {}
     dt = 0.0
     for run, reports in zip(runs, done, strict=True):

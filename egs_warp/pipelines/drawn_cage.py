@@ -1,6 +1,6 @@
 """The cage of a body as players draw it: nodes, tetrahedra and a surface that resembles the body.
 
-Players select bodies and draw shadows with the surface. The surface of a creature is that of its cage. The single
+Players use the surface to select bodies and to draw shadows. The surface of a creature is that of its cage. The single
 tetrahedron of a prop does not resemble the prop, so its drawn cage has further nodes on the zero set of its level set,
 which move affinely with the tetrahedron.
 """
@@ -33,12 +33,12 @@ class DrawnCage:
     surface: np.ndarray
     """(B, 3) nodes of the surface triangles, wound outwards."""
     weights: np.ndarray
-    """(N - C, 4) barycentric weights of the further nodes in the only tetrahedron; (0, 4) if there are none."""
+    """(N - C, 4) barycentric weights of the further nodes in the single tetrahedron; (0, 4) without them."""
 
     @classmethod
     def of(cls, mesh: TetMesh, shape: ContactShape | None = None) -> DrawnCage:
-        """Return the drawn cage of a body with the cage ``mesh`` at rest. ``shape`` has the level set of a prop; the
-        surface without it is that of the tetrahedra."""
+        """Return the drawn cage of a body with the cage ``mesh`` at rest. ``shape`` has the level set of a prop;
+        without it, the surface is that of the tetrahedra."""
         if shape is None or len(mesh.tets) > 1:
             return cls(mesh.nodes, mesh.tets, mesh.boundary_faces(), np.zeros((0, 4)))
         vertices, faces = _surface(mesh, shape)
@@ -49,7 +49,7 @@ class DrawnCage:
         return cls(np.concatenate([mesh.nodes, vertices]), mesh.tets, faces + count, weights)
 
     def positions(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the positions (..., N, 3) m for those of the nodes of the cage, (..., C, 3) m."""
+        """Return the positions (..., N, 3) m for the positions ``nodes`` (..., C, 3) m of the cage of the solver."""
         if len(self.weights) == 0:
             return nodes
         return np.concatenate([nodes, np.einsum("vw,...wi->...vi", self.weights, nodes[..., self.tets[0], :])], axis=-2)

@@ -39,7 +39,7 @@ class ExportedRun(Protocol):
         ...
 
     def splats_of(self) -> Callable[[int], GaussianCloud]:
-        """Return the function that gives the splats of a frame."""
+        """Return the function for the splats of a frame."""
         ...
 
 
@@ -69,8 +69,7 @@ def export_splats(
     the paths.
 
     Files are in the frame and units of the capture, so that they fit its background. Files of a world contain all
-    bodies, in metres and in the frame of the world; ``glb`` files are in metres with
-    y up, as glTF requires.
+    bodies, in metres and in the frame of the world. ``glb`` files are in metres with y up, as glTF requires.
 
     Args:
         run: The run to export.

@@ -217,8 +217,8 @@ def split_deformer(performance: BodyResult, *, in_scene: bool = False) -> Deform
 
 
 def above_ground(cloud: GaussianCloud, height: float) -> GaussianCloud:
-    """Return ``cloud`` without the haze of the captured ground, and cut at the ground: both would be visible below a
-    jumping creature of this ``height`` (m)."""
+    """Return ``cloud`` without the haze of the captured ground, and cut at the ground. Otherwise, what is below the
+    ground would be visible under a jumping creature of this ``height`` (m)."""
     return cut_at(below_ground_hidden(cloud, height), GROUND)
 
 

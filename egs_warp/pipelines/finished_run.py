@@ -134,7 +134,7 @@ class FinishedRun:
         return self.creature.splats.antialiased
 
     def splats_of(self) -> Callable[[int], GaussianCloud]:
-        """Return the function that gives the creature's splats in a frame; each call overwrites the last result."""
+        """Return the function for the creature's splats in a frame; each call overwrites its last result."""
         deformer, t = self.deformer(), self.trajectory
         return lambda frame: deformer.deform(t.positions[self.steps[frame]]).cloud
 

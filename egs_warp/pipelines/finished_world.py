@@ -150,7 +150,7 @@ class FinishedWorld:
         return FilmedWorld(bodies, solids, self.scene, self.first.trajectory.ground_coefficients.size == 0)
 
     def splats_of(self) -> Callable[[int], GaussianCloud]:
-        """Return the function that gives the splats of all bodies in a frame; each call overwrites the last result."""
+        """Return the function for the splats of all bodies in a frame; each call overwrites its last result."""
         filmed = self.filmed
         deformer = filmed.joint_deformer()
         return lambda frame: deformer.deform(filmed.poses(frame)).cloud
@@ -182,5 +182,5 @@ def check_no_background(background: Path | None) -> None:
     """Raise ``ArgumentError`` if a background is given for the run of a world."""
     if background is not None:
         raise ArgumentError(
-            "background", "a world is shown with the scene of its own folder; leave it out", value=background
+            "background", "a scene behind the body is for the run of a single capture; leave it out", value=background
         )

@@ -17,13 +17,14 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.capture import Capture
 from egs_warp.io.planes import PlaneRecord
 from egs_warp.segmentation.base_plane import guess_up
-from egs_warp.segmentation.framing import with_framing
 from egs_warp.segmentation.ground import ROUGH, measure_ground
 from egs_warp.segmentation.object_mask import TOUCHING, segment
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
+from egs_warp.segmentation.photo_clicks import ClicksInPhotos, with_photos
 from egs_warp.segmentation.plane_fit import PlaneFit
 from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under, refine_plane
 from egs_warp.segmentation.resting_plane import remove_foot_remnants, resting_plane
+from egs_warp.segmentation.surface_graph import SurfaceGraph
 from egs_warp.segmentation.table_top import planes_below, surface_around
 from egs_warp.segmentation.votes import votes_of_masks
 
@@ -70,6 +71,8 @@ class LocatedPlane:
     """Measured ground; None if it is flat."""
     in_sight: bool = True
     """False if the plane was placed under the object because the views do not show its support."""
+    surface: SurfaceGraph | None = None
+    """The capture prepared for clicks in photos, if there are any."""
 
     def known(self) -> PlaneRecord:
         """Return the record for ``plane.json``."""
@@ -108,10 +111,13 @@ def locate_plane(
         UserError: There is no plane under the object, or no object.
     """
     notes: list[str] = []
-    spec = with_framing(cloud, spec, cameras)
+    spec = with_photos(cloud, spec, cameras)
+    surface = spec.surface if isinstance(spec, ClicksInPhotos) else None
     if plane is not None:
         segmentation = segment(cloud, plane, spec)
-        return LocatedPlane(plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, ())
+        return LocatedPlane(
+            plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, (), surface=surface
+        )
     tilt = _MAX_TILT
     if up is None and isinstance(cloud, Capture):
         up = cloud.up
@@ -152,7 +158,15 @@ def locate_plane(
         f"{_describe_plane(fit.plane)}: fits {fit.pixel_count} pixels "
         f"to {100 * fit.noise:.2f} % of depth, {100 * fit.inlier_share:.0f} % of them inliers"
     )
-    return LocatedPlane(fit.plane, fit, _middle(cloud, segmentation), segmentation.size, segmentation, tuple(notes))
+    return LocatedPlane(
+        fit.plane,
+        fit,
+        _middle(cloud, segmentation),
+        segmentation.size,
+        segmentation,
+        tuple(notes),
+        surface=surface,
+    )
 
 
 def _fallback_plane(cloud: GaussianCloud, spec: ObjectSpec, plane: Plane, notes: tuple[str, ...]) -> LocatedPlane:
@@ -202,8 +216,9 @@ def with_measured_ground(
             return located
         note = f"the ground seems rough by {rough} of the object's height, but views differ by {noise}: treated as flat"
         return replace(located, notes=(*located.notes, note))
+    spec = with_photos(cloud, spec, cameras, surface=located.surface)
     try:
-        segmentation = segment(cloud, measured.field, with_framing(cloud, spec, cameras), size=located.size)
+        segmentation = segment(cloud, measured.field, spec, size=located.size)
     except UserError as error:
         note = f"the ground is rough by {rough} of the object's height, but is treated as flat ({error})"
         return replace(located, notes=(*located.notes, note))

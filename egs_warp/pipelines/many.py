@@ -135,16 +135,16 @@ def simulate_many(
     job that fails has an error in its result; the others continue.
 
     Args:
-        creature: The creature of all jobs, or the world of all ``WorldJob``.
+        creature: The creature of all jobs, or a world, whose jobs are ``WorldJob``.
         jobs: The jobs.
         workers: Number of processes on this machine; None uses its number of cores; ``"ray"`` or the address of a Ray
             cluster uses the cores of the cluster (docs/guide/many.md).
         worlds: Batch size for the jobs that can run in batches in this process on the creature's device: all jobs,
             unless they are planned with the strategy ``paper`` or the QP solver ``daqp``; not for a world. None uses
-            batches of up to
-            1,024 on a GPU if there are at least two such jobs for each core of this machine. 0 uses no batches.
-        out: Folder for trajectories, ``job-0000.npz`` and so on, which are then not held in memory; of a world
-            ``job-0000/NAME.npz``, which are held in memory, too.
+            batches of up to 1,024 on a GPU if there are at least two such jobs for each core of this machine. 0 uses
+            no batches.
+        out: Folder for trajectories, ``job-0000.npz`` and so on, which are then not held in memory. Those of a world,
+            ``job-0000/NAME.npz``, are held in memory, too.
         ended: Called when a job ends, with its number from 0 and its result.
         progress: Called after each frame with the number of finished frames and the number expected in total.
 
@@ -152,7 +152,7 @@ def simulate_many(
         The results in the order of the jobs.
 
     Raises:
-        UserError: The workers cannot be started, or the jobs are not those of a creature, or of a world.
+        UserError: The workers cannot be started, or a job is of the other kind.
     """
     folder = None if out is None else Path(out)
     if folder is not None:
@@ -160,7 +160,7 @@ def simulate_many(
     kind = WorldJob if isinstance(creature, World) else Job
     if not all(isinstance(job, kind) for job in jobs):
         owner = "a world" if isinstance(creature, World) else "a creature"
-        raise ArgumentError("jobs", f"give only egs.{kind.__name__}, because they are jobs of {owner}")
+        raise ArgumentError("jobs", f"give only egs.{kind.__name__}, the jobs of {owner}")
     if isinstance(creature, World):
         if worlds is not None:
             raise ArgumentError("worlds", "batches are for one creature; leave it out", value=worlds)

@@ -25,19 +25,19 @@ from egs_warp.short_repr import short_repr
 _NEW = -1
 """Index of a Gaussian that is not in the capture."""
 _NEAR_POINT = 16
-"""Number of Gaussians next to a point that a selection by a point stands for."""
+"""Number of Gaussians nearest to a point that count as selected by the point."""
 _MAX_SHARED = 0.5
 """Maximum fraction of the selected Gaussians that may belong to objects that were cut out before."""
 _NOTED = 0.01
 """Fraction of shared Gaussians above which a note is written."""
 _PICKED_NEIGHBOURS = 8
-"""Number of neighbours that decide if new floor belongs to a picked object."""
+"""Number of neighbours that decide whether new floor belongs to a picked object."""
 _MIN_TOP, _ON_TOP = 0.05, 0.08
 """Minimum height above the plane of an object, and maximum distance from the object, of new floor that belongs to it,
 relative to the size of the object."""
 _MAX_TILT, _MAX_OFFSET = 3.0, 0.03
-"""Maximum angle in degrees between the planes of two objects that stand on the same ground, and their maximum distance
-below the objects, as a fraction of the size of the smaller object."""
+"""Maximum angle in degrees between the planes of two objects that stand on the same ground, and maximum distance
+between the planes, as a fraction of the size of the smaller object."""
 
 
 class Preparer(Protocol):
@@ -89,7 +89,7 @@ def prepare_objects(
 ) -> PreparedObjects:
     """Cut several objects out of a capture and fill their holes, one after the other.
 
-    Each object is searched in the background of the objects before it, so an object that stands on another one must
+    Each object is searched for in the background of the one before it, so an object that stands on another one must
     come first: the hole that it leaves is then filled with the surface of the other one.
 
     Args:
@@ -169,12 +169,12 @@ def _shared(cloud: GaussianCloud, spec: ObjectSpec, owners: np.ndarray, names: S
     share = float(taken.mean())
     if share > _MAX_SHARED:
         raise UserError(
-            f"{100 * share:.0f} % of what selects it belongs to {other}, which is cut out first; name the object that"
-            " stands on the other one first, or remove this one from the other one by clicks -u,v@photo"
+            f"{100 * share:.0f} % of its selected Gaussians belong to {other}, which is cut out before it; give the"
+            " object that stands on the other one first, or exclude this one from the other one with clicks -u,v@photo"
         )
     if share < _NOTED:
         return ()
-    return (f"{100 * share:.0f} % of what selects it belongs to {other}, which keeps it",)
+    return (f"{100 * share:.0f} % of its selected Gaussians belong to {other}, which keeps them",)
 
 
 def _selected(cloud: GaussianCloud, spec: ObjectSpec) -> np.ndarray:
@@ -220,8 +220,8 @@ def _in_remaining_scene(spec: ObjectSpec, cloud: GaussianCloud, rest: GaussianCl
 def _with_new_floor(
     scene: PreparedScene, origins: np.ndarray, is_earlier: np.ndarray
 ) -> tuple[PreparedScene, np.ndarray]:
-    """Move new floor that lies on top of the object from the background to the object: the floor was made where another
-    object had stood, and the search for this object may have missed it.
+    """Move new floor that lies on top of the object from the background to the object. It filled the hole of an earlier
+    object, and the search for this object may have missed it.
 
     Args:
         scene: The prepared object.

@@ -93,7 +93,7 @@ def info_bar(
 ) -> Iterator[Callable[[str], None]]:
     """Show a bar for ``inspect_capture``; call the yielded function with the name of each stage as it starts.
 
-    ``checks_balance`` is true if muscles of a file are tried in a short stand.
+    ``checks_balance`` is True if muscles of a file are checked in a short stand.
     """
     stages = _BALANCE_STAGES if checks_balance else _INFO_STAGES
     with _stages("look", stages, quiet=quiet, file=file) as begins:

@@ -30,25 +30,25 @@ _CELL = 0.04
 """Distance between lattice points, relative to the height of the tallest object."""
 _REACH, _DEPTH, _ABOVE = 2.5, 2.0, 0.5
 """Extent of the lattice: beside the objects, below the ground and above the highest object, relative to the height of
-the tallest object. A body that falls over the edge of the ground lands on a floor at this depth, unless the capture
-shows a surface above it."""
+the tallest object. A body that falls over the edge of the ground lands on a floor at the depth ``_DEPTH``, unless the
+capture shows a surface above it."""
 _OPACITY = 0.5
 """Sum of opacities above which a cell is occupied."""
 _MIN_OPACITY, _MAX_WIDTH = 0.2, 0.25
-"""Minimum opacity of Gaussians that count, and maximum smallest standard deviation relative to the height of the
-tallest object; others are haze."""
+"""Minimum opacity of Gaussians that count, and maximum of their smallest standard deviation, relative to the height of
+the tallest object; others are haze."""
 _MAX_SIGMA = 0.5
 """Maximum standard deviation of a Gaussian in the lattice, relative to the height of the tallest object."""
 _BAND = 1.5
 """Maximum distance of ground cells from the ground, cells."""
 _CLOSED = 2
-"""Half width of gaps in the ground that are closed, cells."""
+"""Maximum half width of gaps in the ground that are closed, cells."""
 _MIN_GROUND, _MAX_HOLE = 40, 200
 """Minimum number of columns of a part of the ground, and maximum number of columns of a hole in it that is closed."""
 _FOOT = 0.1
-"""Height up to which a part of an object stands on the ground, relative to the height of the tallest object."""
+"""Height below which points of an object are its feet, relative to the height of the tallest object."""
 _MIN_EDGE = 0.02
-"""Fraction of the columns without ground from which the ground has an edge."""
+"""Fraction of columns without ground above which the ground has an edge."""
 _MIN_SOLID = 60
 """Minimum number of cells of an obstacle; smaller parts are specks."""
 _CLEARANCE = 2
@@ -113,7 +113,7 @@ def measure_obstacles(
         frame: Frame of the world in the capture.
         height: Height of the tallest object, m.
         solids: Obstacles in the frame and units of the capture that replace the measured ones; None measures them.
-        is_measured: Measure the edge of the ground and the obstacles.
+        is_measured: True to measure the edge of the ground and the obstacles.
     """
     given = None if solids is None else tuple(Solid(tuple(frame.plane(face) for face in one.faces)) for one in solids)
     objects = {name: _points(scene.object, frame) for name, scene in prepared.scenes.items()}
@@ -202,8 +202,8 @@ def _measured_ground(prepared: PreparedObjects, frame: BodyFrame, lattice: _Latt
 
 
 def _heights_along_z(field: HeightField, points: np.ndarray) -> np.ndarray:
-    """Return the heights (...,) m of ``field`` along z over ``points`` (..., 3) m of the plane z = 0, by Newton's
-    method."""
+    """Return the heights (...,) m of ``field`` along z over ``points`` (..., 3) m of the plane z = 0, by simplified
+    Newton iterations with the normal of the reference plane."""
     up, moved = np.array([0.0, 0.0, 1.0]), points.copy()
     for _ in range(4):
         moved = moved - (field.heights(moved) / float(up @ field.normal))[..., None] * up
@@ -212,7 +212,7 @@ def _heights_along_z(field: HeightField, points: np.ndarray) -> np.ndarray:
 
 def _known_ground(lattice: _Lattice, heights: np.ndarray, feet: np.ndarray) -> np.ndarray:
     """Return the columns (nx, ny) bool that have ground at ``heights`` (nx, ny) m. The columns of the ``feet`` (n, 3)
-    m, lower parts of the objects, and small holes count as ground."""
+    m, which are the lower parts of the objects, and small holes count as ground."""
     band = np.abs(lattice.axis(2) - heights[..., None]) <= _BAND * lattice.spacing
     known = (lattice.occupied & band).any(axis=2)
     at = lattice.cells_of(feet)
@@ -231,7 +231,7 @@ def _with_edge(
     field: HeightField, lattice: _Lattice, heights: np.ndarray, known: np.ndarray, height: float
 ) -> HeightField:
     """Return the ground that falls, beyond the ``known`` (nx, ny) columns, to the highest occupied cell below it, or to
-    a floor ``_DEPTH`` below z = 0. The slope of the edge is one node wide."""
+    a floor ``_DEPTH`` below z = 0. The slope at the edge is one spacing of the nodes wide."""
     z = lattice.axis(2)
     below = lattice.occupied & (z < heights[..., None] + _BAND * lattice.spacing)
     top = np.where(below, z, -_DEPTH * height).max(axis=2)
@@ -239,11 +239,11 @@ def _with_edge(
     top = np.asarray(ndimage.median_filter(top, 5))
     nodes = field.nodes()
     at = ((nodes[..., :2] - lattice.origin[:2]) / lattice.spacing).transpose(2, 0, 1)
-    # Half a cell more: the outermost ground cells are captured up to their far side.
+    # Because of the dilation, the ground ends one cell beyond the far side of its outermost cells.
     wide = np.asarray(ndimage.binary_dilation(known))
     is_ground = ndimage.map_coordinates(wide.astype(float), at, order=1, mode="nearest") > 0.5
     lower = ndimage.map_coordinates(top, at, order=1, mode="nearest")
-    # The nodes are the coefficients of the spline, which then does not overshoot at the edge.
+    # Take the heights of the nodes as coefficients of the spline, so that it does not overshoot at the edge.
     return replace(field, coefficients=np.where(is_ground, field.coefficients, np.minimum(lower, field.coefficients)))
 
 

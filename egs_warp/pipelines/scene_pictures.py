@@ -93,7 +93,7 @@ def _ground_cloud(obstacles: SceneObstacles, device: str) -> GaussianCloud:
     points = nodes.reshape(-1, 3)
     depth = np.clip(points[:, 2] / (_LOWER * low[2]), 0.0, 1.0)[:, None]
     colours = (1.0 - depth) * _GROUND_COLOUR + depth * _LOWER_COLOUR
-    # Every second row and column is darker, so that the slope is visible.
+    # A checkerboard with fields of 4 x 4 nodes shows the slope.
     rows, columns = np.indices(nodes.shape[:2])
     colours = colours * np.where((rows // 4 + columns // 4) % 2, 0.75, 1.0).reshape(-1, 1)
     return GaussianCloud.from_numpy(

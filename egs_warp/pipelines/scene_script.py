@@ -1,4 +1,4 @@
-"""The scene of a world file: files are read, objects selected and cut out, and placed in a world."""
+"""The scene of a world file: read its files, select its objects, cut them out and place them in a world."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class SceneRequest:
 
 @dataclass(frozen=True)
 class SceneProgress:
-    """Functions that are called in the course of the preparation of a world, so that a later error loses nothing."""
+    """Functions that receive intermediate results during the preparation of a world, before a later error."""
 
     show_stage: Callable[[str], object] = lambda stage: None
     """Called with a description of each stage as it starts."""
@@ -80,7 +80,7 @@ class SceneProgress:
 
 @dataclass(frozen=True)
 class SceneParts:
-    """The world of a scene, and what it was made of."""
+    """The world of a scene, and the capture, cameras and objects from which it was made."""
 
     __repr__ = short_repr
 
@@ -109,7 +109,7 @@ def read_scene_parts(
         request: The scene and its objects.
         device: Warp device.
         solids: Further obstacles in the frame of the world, m.
-        progress: Functions that are called in the course of the preparation.
+        progress: Functions that are called during the preparation.
 
     Raises:
         UserError: A file or a value is invalid, or a stage failed. A message on an object begins with its name.
@@ -193,7 +193,7 @@ def _prepared(
             cloud,
             spec,
             cameras=[one.camera for one in posed],
-            # Photos show the objects that have been cut out before.
+            # Only for the capture itself, because the photos show objects that have been cut out.
             photographs=photographs_in_colours_of(cloud, posed) if isinstance(cloud, Capture) else None,
             up=direction,
             plane=plane,

@@ -1,4 +1,4 @@
-"""The surroundings of the bodies of a world: what stays of a captured scene, drawn behind them and as obstacles."""
+"""The surroundings of the bodies of a world: what remains of a captured scene, as background and obstacles."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from egs_warp.pipelines.usd_body import define_body, define_material, define_sur
 
 CREATURE, WORLD = "/creature", "/world"
 _SURROUNDINGS = ("physics", "ground", "scene")
-"""Prims of a world that are no bodies."""
+"""Prims of a world that are not bodies."""
 SPLATS, CAGE, MUSCLES, FORCES, SCENE = "splats", "cage", "muscles", "forces", "scene"
 _WIDTH = 0.004
 """Width of the curves, m."""
@@ -126,7 +126,7 @@ class _BodyPrims:
         self._weight = float(t.node_mass.sum() * np.linalg.norm(t.gravity))
         self.material = define_material(stage, path, t)
         """Material of the body."""
-        # A prop is stiff; its single tetrahedron is no mesh of its volume.
+        # A prop is stiff, and its single tetrahedron does not mesh its volume.
         self._soft_body = define_body(stage, path, t, self.material) if len(t.tets) > 1 else None
 
     def write_frame(self, index: int, *, is_first: bool) -> None:
@@ -155,7 +155,7 @@ class _BodyPrims:
 
 
 def _identifiers(names: list[str]) -> list[str]:
-    """Return a different identifier of USD for each of the ``names``."""
+    """Return a unique USD identifier for each of the ``names``."""
     found: list[str] = []
     for name in names:
         base = import_module("pxr.Tf").MakeValidIdentifier(name)

@@ -1,4 +1,4 @@
-"""A world: several bodies, creatures and props, placed on a common ground or where a scene was captured."""
+"""A world: several bodies, creatures and props, on a common ground or at their captured places in a scene."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _MAX_RAISE = 0.1
 """Maximum height by which a body is raised at the start so that it is not inside the ground or a body below it, in body
 heights."""
 _RAISE_TOLERANCE = 1e-4
-"""Depth in the ground at the start that is left, in body heights."""
+"""Depth in the ground or in a body below up to which a body is not raised at the start, in body heights."""
 _NEAR_GROUND = 0.02
 """Distance from the ground within which a body comes to rest on uneven ground before the start, in body heights."""
 _ON_BODY = 0.08
@@ -85,7 +85,7 @@ class World:
                 and uses the geometric mean of two coefficients between bodies.
             ground: Uneven ground in the frame of the world, whose heights are measured along z; None uses the ground of
                 the surroundings, or the plane z = 0.
-            surroundings: What stays of a captured scene: background of the film, ground and obstacles.
+            surroundings: What remains of a captured scene: background of the film, ground and obstacles.
 
         Raises:
             UserError: The friction is invalid, or the heights of the ground are not measured along z.
@@ -129,9 +129,9 @@ class World:
             heading: Direction in which a creature faces, degrees counter-clockwise from the x axis of the world, seen
                 from above. A prop is turned by this angle. None keeps the orientation of the body's own frame.
             name: Name for messages and files; None numbers the bodies: ``creature-1``, ``prop-2``.
-            path: Path that a prop follows from its place, whatever pushes it, such as a lift. It passes through the
-                ground and solids of the world, but carries and pushes other bodies.
-            as_captured: Place the body where it is in the scene of the surroundings, whose capture it belongs to;
+            path: Path that a prop, such as a lift, follows from its place, whatever pushes it. The prop passes through
+                the ground and solids of the world, but carries and pushes other bodies.
+            as_captured: Place the body where it is in the scene of the surroundings, to whose capture it belongs;
                 ``at``, ``above`` and ``heading`` do not apply. It is raised slightly if it is inside the ground or a
                 body below it.
 
@@ -140,8 +140,8 @@ class World:
 
         Raises:
             UserError: The name or the position is invalid, the name is taken, the body is on a GPU, the ground of the
-                body is not a level plane, the body overlaps a solid or another body, it does not stand on uneven ground
-                at this place, or a creature has a path.
+                body is not a level plane, the body overlaps a solid or another body, it falls over on uneven ground at
+                this place, or a creature has a path.
         """
         kind = "prop" if isinstance(body, Prop) else "creature"
         name = f"{kind}-{len(self._members) + 1}" if name is None else name

@@ -78,7 +78,7 @@ def read_world(
 
 
 def read_world_file(path: Path, progress: SceneProgress, *, device: str | None = None) -> WorldScript:
-    """Read a world file like ``read_world``; the functions of ``progress`` are called in the course of it."""
+    """Read a world file like ``read_world``; the functions of ``progress`` are called meanwhile."""
     tree, node = read_yaml(path)
     check_schema(path, tree, node, SCHEMA)
     entries = tree["bodies"]
@@ -90,7 +90,7 @@ def read_world_file(path: Path, progress: SceneProgress, *, device: str | None =
             raise UserError(f"{path}, line {line}: {key} is for a scene; add scene: capture, or leave it out")
     names = _object_names(path, entries, node)
     for index, entry in enumerate(entries):
-        # Read first, because the bodies take longer.
+        # Check motions and pushes before any body is created, which takes longer.
         with _at_line(path, node, index):
             if "motion" in entry:
                 check_motion(entry["motion"])

@@ -1,4 +1,4 @@
-"""Film of a world: all bodies are deformed and drawn together, with their shadows on the ground and each other."""
+"""Film of a world: all bodies are deformed and drawn together, with shadows on the ground and on each other."""
 
 from __future__ import annotations
 

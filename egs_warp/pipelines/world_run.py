@@ -114,8 +114,8 @@ class PassiveMotion:
     def __init__(self, prop: Prop, path: RigidPath | None) -> None:
         self._rest, self._path_end = RestDetector(prop.body), None if path is None else path.end
         self.is_at_rest = False
-        """True once the fastest node has been slow for a while (``RestDetector``), or at the end of a path. A path that
-        is repeated has no end, so the run does not wait for it."""
+        """True once the fastest node has been slow for a while (``RestDetector``), or from the end of a path on. It is
+        always True for a path that is repeated, which has no end."""
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Update ``is_at_rest``; return no objectives."""
@@ -144,8 +144,8 @@ def simulate_world(
     """Simulate a world; the other arguments are described at ``simulate``.
 
     Args:
-        parts: Function that returns the folder for the finished steps of the body with a name; None writes none.
-        resume: Folder of the interrupted run of this world to continue; the steps are in the folders of the bodies.
+        parts: Function that returns the folder for the finished steps of the named body; None writes none.
+        resume: Folder of an interrupted run of this world to continue; the steps are in the folders of the bodies.
     """
     check_frames(frames)
     if not world.members:

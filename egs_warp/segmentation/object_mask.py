@@ -17,6 +17,7 @@ from egs_warp.segmentation.connectivity import close_to, connected_parts, enclos
 from egs_warp.segmentation.floor_remnants import floor_remnants, floor_scatter_height
 from egs_warp.segmentation.labels import labels_of_votes, smoothed_labels
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
+from egs_warp.segmentation.photo_clicks import ClicksInPhotos, picked_in_photos
 from egs_warp.segmentation.votes import votes_of_masks
 
 _NOTHING_ABOVE = (
@@ -79,6 +80,8 @@ def segment(
             point; the object does not touch the plane; or nothing is left of it.
     """
     scene = SceneAbovePlane.of(cloud, plane)
+    if isinstance(spec, ClicksInPhotos):
+        spec = picked_in_photos(spec, scene)
     if spec.masks:
         claimed_by_user, unknown = _masked(scene, spec)
     elif spec.picked is not None:
@@ -90,7 +93,7 @@ def segment(
     try:
         return _of_size(scene, claimed_by_user, unknown, spec, size, hover)
     except UserError:
-        if spec.point is None:
+        if spec.point is None or spec.picked is not None:
             raise
         for halving in range(1, _HALVINGS + 1):
             smaller = size * 0.5**halving
@@ -302,7 +305,7 @@ def _first_size(scene: SceneAbovePlane, claimed_by_user: np.ndarray, spec: Objec
     standing = claimed_by_user & scene.is_opaque & (scene.heights > 0.0)
     if not standing.any():
         raise UserError(_NOTHING_ABOVE, check=("plane",))
-    return _diagonal(scene.means[standing]) * (0.5 if spec.point is not None else 1.0)
+    return _diagonal(scene.means[standing]) * (0.5 if spec.point is not None and spec.picked is None else 1.0)
 
 
 def _diagonal(points: np.ndarray) -> float:

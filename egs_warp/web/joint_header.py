@@ -1,4 +1,4 @@
-"""Header of a page that shows several bodies: their cages, muscles and splats are joined into those of one creature.
+"""Header of a page that shows several bodies: their cages, muscles and splats are concatenated as for one creature.
 
 Indices of nodes, tetrahedra, ends of muscles, fibres and feet are shifted, so that every layer of the page draws all
 bodies. The fact ``bodies`` lists the part of each body.

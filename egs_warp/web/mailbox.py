@@ -24,7 +24,7 @@ class Mailbox:
     """Queue of messages and queue of news, with one condition that signals every change."""
 
     def __init__(self, changed: threading.Condition | None = None) -> None:
-        """Create empty queues; ``changed`` is a condition that several mailboxes share, or None for an own one."""
+        """Create empty queues; ``changed`` is a condition that several mailboxes share; None creates one."""
         self.watched = False
         """True if a page is subscribed."""
         self.stopping = False

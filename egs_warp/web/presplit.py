@@ -28,7 +28,8 @@ def presplit_gaussians(creature: Creature, *, hides_ground: bool) -> GaussianClo
 
     Args:
         creature: The creature.
-        hides_ground: True if only flat ground is drawn around it: what crosses the ground is cut at it, as in a film.
+        hides_ground: True if the page draws a flat floor instead of a scene. As in a film, Gaussians that cross the
+            floor are then cut at it, and those below it are hidden.
     """
     height = creature.body.height
     cloud = above_ground(creature.cloud, height) if hides_ground else creature.cloud

@@ -1,4 +1,4 @@
-"""Feed of a live session of a world: each page that connects gets its own queue and steers one creature."""
+"""Feed of a live session of a world: each page that connects has its own mailbox and steers one creature."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def world_view(world: World, *, size: int = 512) -> Camera:
     if np.linalg.norm(ahead) < 0.5 * len(faces):
         ahead = np.array([faces[0][1], -faces[0][0]]) if faces else np.array([1.0, 0.0])
     ahead = ahead / np.linalg.norm(ahead)
-    # A view from the side of the front shows a face best.
+    # A three-quarter view shows a face best.
     turn = np.radians(-35.0)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     level = rotation @ ahead

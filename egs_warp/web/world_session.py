@@ -1,6 +1,6 @@
-"""Live session of a world: a thread that simulates all bodies; each page steers one creature with its own queue.
+"""Live session of a world: a thread that simulates all bodies; each page steers one creature.
 
-The creatures have schedulers of their own. Messages of a page go to the creature that the page has selected; pausing,
+Each creature has its own queue of motions. Messages of a page go to the creature that the page has selected; pausing,
 single steps and the reset concern the whole world.
 """
 
@@ -74,7 +74,7 @@ class SteeredBody:
 
     @property
     def is_resting(self) -> bool:
-        """True if the body is still and has no task, and its path has ended, if it follows one."""
+        """True if the body is still and has no task, and its path, if any, has ended."""
         path = self.member.path
         if path is not None and (path.repeat or self.state.time < path.end):
             return False
@@ -111,7 +111,7 @@ class WorldPage:
         index = next((i for i, body in enumerate(self.session.bodies) if body.member.name == name), None)
         if index is None or self.session.bodies[index].steering is None:
             names = [body.member.name for body in self.session.bodies if body.steering is not None]
-            raise ValueError(f"select: {name[:40]!r} is no creature of this world; give {', '.join(names)}")
+            raise ValueError(f"select: {name[:40]!r} is not a creature of this world; give {', '.join(names)}")
         self.session.select(self, index)
 
 
@@ -121,7 +121,7 @@ class WorldSession:
     def __init__(self, world: World, page_bodies: Sequence[PageBody]) -> None:
         """Create a session that is not started. Raises ``UserError`` for a world without a creature."""
         if not any(isinstance(member.body, Creature) for member in world.members):
-            raise UserError("world: it has no creature to steer; leave out prop: true of a body")
+            raise UserError("world: it has no creature to steer; remove prop: true from a body")
         self.world, self.page_bodies = world, tuple(page_bodies)
         self.changed = threading.Condition()
         """Condition that the mailboxes of all pages share."""

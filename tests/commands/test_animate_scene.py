@@ -41,8 +41,8 @@ def test_motions_are_given_by_name_or_to_all_creatures() -> None:
     }
     assert motions_of("hop x3", names, ["box"]) == {"a": "hop x3", "b": "hop x3"}
     for text, message in (
-        ("c: jump", "it has no name of an object.*give NAME: MOTION"),
-        ("a: jump; walk 1", "'walk 1': it has no name of an object"),
+        ("c: jump", "it does not begin with the name of an object.*give NAME: MOTION"),
+        ("a: jump; walk 1", "'walk 1': it does not begin with the name of an object"),
         ("box: jump", "box is a prop, which has no muscles; leave --prop box out"),
         ("a: jump; a: walk 1", "a has another motion, too"),
         ("a: fly", "fly"),
@@ -58,7 +58,10 @@ def test_motions_are_given_by_name_or_to_all_creatures() -> None:
         (["--object", "a=0,0,0.5", "--prop", "b"], "--prop b: no object has this name; give one of a"),
         (["--object", "a=0,0,0.5", "--terrain", "t.json"], "--terrain: it has no effect on several objects"),
         (["--object", "0,0,0.5", "--prop", "b"], "--prop: it is for objects with names"),
-        (["--object", "a=0,0,0.5", "--motion", "b: jump"], "--motion 'b: jump': it has no name of an object"),
+        (
+            ["--object", "a=0,0,0.5", "--motion", "b: jump"],
+            "--motion 'b: jump': it does not begin with the name",
+        ),
         (["--object", "a=0,0,0.5", "--object", "b=nothing.png"], "b: --object nothing.png: neither a file nor numbers"),
         (["--object", "a=0,0,0.5", "--collision-mesh", "no.glb"], "no.glb: no such file"),
     ],

@@ -60,7 +60,7 @@ def test_a_world_file_gives_one_film_and_the_files_of_each_body(
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--friction", "0.2"], "--friction: is for a single capture"),
+        (["--friction", "0.2"], "--friction: it is for a single capture"),
         (["--background", "pawn.ply"], "--background pawn.ply: no such file"),
         (["--frames", "1"], "--frames 1"),
     ],

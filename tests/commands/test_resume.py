@@ -234,7 +234,7 @@ def test_runs_that_cannot_be_resumed_are_reported(tmp_path: Path, capsys: pytest
         manifest.write_text(broken)
         assert told(out) == f"egs-warp: {manifest}: not a manifest of a run; start the run again\n"
     manifest.write_text(json.dumps(content | {"version": "0.1.0"}))
-    assert "run.yaml: is missing; the run was interrupted before its first step; start it again" in told(out)
+    assert "run.yaml: is missing; the run was interrupted before its first step" in told(out)
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=50, device="cpu").cloud)
     (out / "run.yaml").write_text("capture: ../pawn.ply\nup: z\ncapture_sha256: 0\n")
     assert "pawn.ply: differs from the capture of the run; restore that file, or start the run again" in told(out)

@@ -1,4 +1,4 @@
-"""A body darkens the Gaussians of another body by a formula of its gap and its normal, and not its own."""
+"""A body darkens the Gaussians of another body, but not its own, by a formula of their gap and of its normal."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_darkening_below_beside_and_above_a_body(soft: bool) -> None:
         )
     lift = np.array([0.0, 0.0, 1.0])
     poses = [body.stepper.body.mesh.nodes + lift * index for body, index in zip(bodies, (1, 0), strict=True)]
-    # The first body is at heights 1 to 1.4, the second one, which has the Gaussians, below it.
+    # The first body, at heights 1 to 1.4, has one Gaussian; the second one, below it, has four.
     points = np.array([[0.0, 0.0, 0.98], [0.32, 0.0, 1.2], [0.0, 0.0, 1.42], [0.0, 0.0, 0.8]])
     joint = _cloud(np.concatenate([points[:1], points]))
     # The shapes must be near each other for a shadow: move the second body up to the first one.

@@ -134,7 +134,7 @@ def test_an_index_beyond_the_cage_is_found(name: str, tmp_path: Path, capsys: py
 @pytest.mark.parametrize(
     ("name", "position", "said"),
     [
-        ("order", 0, "order does not have each node once"),
+        ("order", 0, "order does not contain each node exactly once"),
         ("parents", 3, "parents has a position that is not before its own"),
         ("weights", 0, "the weights of the first position are not 0"),
     ],

@@ -43,7 +43,7 @@ def test_positions_are_within_half_a_step_of_the_diagonal() -> None:
 
 
 def test_residuals_of_a_smooth_motion_are_near_the_rounding_of_the_positions() -> None:
-    """Displacements of hundreds of steps leave residuals of one or two; those of the first nodes are larger."""
+    """Displacements of hundreds of steps leave residuals of a few steps; those of the first nodes are larger."""
     track = NodeTrack.fitted(REST, _swing(120))
     stored = track.predictor.residuals(track.displacements).stored.reshape(120, -1, 3)
     assert np.abs(track.displacements).mean() > 300.0

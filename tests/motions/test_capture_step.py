@@ -58,7 +58,7 @@ def test_a_body_moves_only_if_its_capture_point_has_left_the_support(mesh: Any, 
 
 @pytest.mark.parametrize("angle", [0.0, 0.5 * np.pi, np.pi])
 def test_a_hop_follows_the_fall(angle: float) -> None:
-    """The hop leads along the velocity, and is longer after a stronger push, up to the maximum."""
+    """The hop is along the velocity, and is longer after a stronger push, up to the maximum."""
     place = block_place()
     along = np.array([np.cos(angle), np.sin(angle), 0.0])
     hops = [begun(place, speed * along) for speed in (1.4, 2.0, 9.0)]
@@ -71,7 +71,7 @@ def test_a_hop_follows_the_fall(angle: float) -> None:
 
 
 def test_feet_step_under_the_capture_point() -> None:
-    """The walk starts with a swing, of the feet with the smaller load, and leads along the velocity."""
+    """The walk starts with a swing of the feet with the smaller load, and is along the velocity."""
     place = block_place(coarse_stool())
     walk = begun(place, np.array([0.0, -2.0, 0.0]))
     assert isinstance(walk, Walk)

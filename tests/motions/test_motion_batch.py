@@ -22,7 +22,7 @@ from tests.support.creatures import coarse_pawn, on_its_rim
 
 CPU = torch.device("cpu")
 SCRIPTS = ("jump 0.2", "jump 0.6 0.3", "twist 60", "twist -30", "hop 0.3", "stand 0.05, jump 0.3", "stand 1", "nod")
-"""Scripts of the worlds; the nod has no world axis."""
+"""Scripts of the worlds; stands and the nod have no world axis."""
 
 
 @pytest.fixture(scope="module")

@@ -134,7 +134,7 @@ def test_a_pushed_body_moves_with_the_push_and_keeps_its_feet(
 def test_a_hard_push_topples_a_body_that_keeps_its_feet(
     standing_block: CoarseCreature, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The push adds more energy than lifts the centre of mass over the edge, so that no controller can keep balance
+    """The push adds more energy than lifting the centre of mass over the edge takes, so no controller can keep balance
     without a step."""
     monkeypatch.setattr("egs_warp.motions.stand.MAX_CAPTURE_STEPS", 0)
     simulation, fallen = simulate_pushes(standing_block, HARD_PUSH, frames=90)

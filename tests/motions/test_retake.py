@@ -51,7 +51,7 @@ def test_the_motion_that_fell_becomes_softer_and_then_lower(place: Stance) -> No
 
 @pytest.mark.parametrize("text", ["walk 0.5", "walk to 0.4,0.2", "turn 90", "run 0.5"])
 def test_walks_take_shorter_steps_to_the_same_place(text: str, place: Stance) -> None:
-    """A run, which has no form in jumps, takes steps of a quarter of the length in its third take."""
+    """A run, which has no retake in jumps, takes steps of a quarter of the length in its third take."""
     walks = [begun(retaken(motion(text), *[0] * count)[0], place)[0] for count in (0, 1, 2)]
     usual, *shorter = (walk for walk in walks if isinstance(walk, Walk))
     assert len(shorter) == (2 if text.startswith("run") else 1)

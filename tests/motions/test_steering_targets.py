@@ -92,4 +92,4 @@ def test_a_body_walks_away_only_from_a_near_one() -> None:
     away = avoid.goal(view(1.5, box.touching + 0.2))
     assert away is not None and away[1] > 1.0
     avoid.goal(view(1.5, 0.5 * box.touching))
-    assert avoid.failures(view(0.0, 0.0)) == ("box touched it",)
+    assert avoid.failures(view(0.0, 0.0)) == ("box was touched",)

@@ -72,7 +72,7 @@ def test_a_walk_to_a_prop_is_refused_with_one_line() -> None:
     ("text", "message"),
     [
         ("hop, jump to kong", r"motion 2 \('jump to kong'\): no body 'kong' \(did you mean 'king'\?\)"),
-        ("face king x2", "cannot be repeated"),
+        ("face king x2", "face cannot be repeated with x2; write the motion again"),
         ("walk to king gab=2", r"'gab=2' \(did you mean 'gap'\?\): walk to takes the numbers gap"),
         ("folow king", r"unknown motion 'folow' \(did you mean 'follow'\?\)"),
         ("kick", "name a body of the world after kick"),

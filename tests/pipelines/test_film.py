@@ -13,7 +13,7 @@ from tests.support.meshes import block_mesh
 
 
 def _performance(ground: np.ndarray) -> Any:
-    """Return a block that bends while it holds a wide Gaussian, of which a quarter is below the ground."""
+    """Return a bending block with a wide embedded Gaussian, of which a quarter is below the ground."""
     mesh = block_mesh(4, 4, 4)
     middle, height = mesh.nodes.mean(axis=0), float(np.ptp(mesh.nodes[:, 2]))
     mean = [middle[0], middle[1], 0.7 * 0.2 * height]

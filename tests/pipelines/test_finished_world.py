@@ -110,7 +110,9 @@ def test_incomplete_folders_are_reported(folder: Path, tmp_path: Path, capsys: p
     assert f"--to skin: a skin has one body; export the folder of a body, such as {folder / 'block'}" in (
         capsys.readouterr().err
     )
-    with pytest.raises(UserError, match=r"background .*: a world is shown with the scene of its own folder"):
+    with pytest.raises(
+        UserError, match=r"background .*: a scene behind the body is for the run of a single capture; leave it out"
+    ):
         read_finished(folder, background=tmp_path / "a.ply")
     shape = (folder / "block" / SHAPE).read_bytes()
     (folder / "block" / SHAPE).write_bytes((folder / "box-1" / SHAPE).read_bytes())

@@ -38,7 +38,7 @@ def mask_of(indices: np.ndarray, count: int = COUNT) -> np.ndarray:
 
 
 class FakePreparer:
-    """Cuts out the picked Gaussians, removes one more, and adds three Gaussians of new floor."""
+    """Preparer that cuts out the picked Gaussians, removes one more, and adds three Gaussians of new floor."""
 
     def __init__(self, tilt: float = 0.0) -> None:
         self.specs: list[ObjectSpec] = []
@@ -91,10 +91,12 @@ def test_the_second_object_is_found_in_what_the_first_one_leaves() -> None:
 
 
 def test_an_object_that_belongs_to_an_earlier_one_is_refused() -> None:
-    with pytest.raises(UserError, match=r"^second: 80 % of what selects it belongs to first, which is cut out first"):
+    with pytest.raises(
+        UserError, match=r"^second: 80 % of its selected Gaussians belong to first, which is cut out before it;"
+    ):
         prepared(ObjectSpec(picked=mask_of(FIRST)), ObjectSpec(picked=mask_of(np.arange(2, 12))))
     result = prepared(ObjectSpec(picked=mask_of(FIRST)), ObjectSpec(picked=mask_of(np.arange(8, 18))))
-    assert result.notes[1] == "second: 20 % of what selects it belongs to first, which keeps it"
+    assert result.notes[1] == "second: 20 % of its selected Gaussians belong to first, which keeps them"
 
 
 def test_objects_on_the_same_ground_have_one_plane_and_others_parallel_ones() -> None:

@@ -43,7 +43,7 @@ def test_the_ground_of_a_table_ends_at_its_edge() -> None:
 
 
 def test_what_stands_beside_the_object_is_solid_and_the_object_is_free() -> None:
-    """Tops and sides of the box are found to a cell of 0.04 m, down to the table, and nothing else is solid."""
+    """The box is found down to the table, its top to 1.5 cells of 0.04 m, and nothing else is solid."""
     found = obstacles_of(TABLE, BOX)
     assert 1 <= len(found.solids) <= 3
 

@@ -14,7 +14,7 @@ from egs_warp.render.projection import project, view_from_camera
 
 @pytest.mark.parametrize(("antialiased", "coefficients"), [(False, 1), (True, 16)])
 def test_lanes_equal_the_kernel_for_one_gaussian(antialiased: bool, coefficients: int) -> None:
-    """1003 Gaussians, which are no multiple of the lanes: opaque, faint and huge ones, behind and beside the camera."""
+    """1003 is no multiple of the number of lanes. Some Gaussians are faint, huge, behind or beside the camera."""
     random, count = np.random.default_rng(4), 1003
     rotations = random.normal(size=(count, 4))
     rotations[5] = 0.0

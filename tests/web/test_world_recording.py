@@ -58,5 +58,5 @@ def test_a_click_selects_a_body(chromium: Any, tmp_path: Path, scheme: str) -> N
 def test_a_background_is_refused(tmp_path: Path) -> None:
     folder = write_world_run(tmp_path / "run")
     assert isinstance(read_recording(folder), WorldRecording)
-    with pytest.raises(UserError, match="a world is shown with the scene of its own folder"):
+    with pytest.raises(UserError, match="a scene behind the body is for the run of a single capture; leave it out"):
         read_recording(folder, background=tmp_path / "a.ply")

@@ -1,4 +1,4 @@
-"""Darkening of the Gaussians of a body where another body is close and hides a part of the sky."""
+"""Kernel that darkens the Gaussians of a body where another body is close and hides part of the sky."""
 
 import warp as wp
 

@@ -51,7 +51,7 @@ _SHARED = (
 
 _EACH_BLOCK = """
         for (int k = 0; k < count; ++k) {
-            // The number of blocks of a splat cannot be predicted: it is computed well before it is used.
+            // The processor cannot predict the number of blocks of a splat: it is computed well before it is used.
             const int id = gaussians.data[begin + k];
             if (begin + k + BATCH < end) {
                 const int next_id = gaussians.data[begin + k + BATCH];
@@ -87,7 +87,7 @@ _EACH_BLOCK = """
                 const f16 dy = near_y + down[block];
                 const f16 u = near_x + across[block] + shear * dy;
                 const f16 level = peak - steep_y * dy * dy - steep_x * u * u;
-                // Undefined where the level is below the faintest.
+                // Unused where the level is below the faintest; the power is undefined there.
                 const f16 whole = __builtin_elementwise_roundeven(level);
                 const f16 raw = power_of_two(whole, level - whole);
                 const f16 before = channels[PASSING];

@@ -76,7 +76,7 @@ SCREEN_COVARIANCES = (
         const f16 determinant = sharp_determinant + LOW_PASS * (sharp_xx + sharp_yy) + LOW_PASS * LOW_PASS;
 """
 )
-"""Head of a loop over the Gaussians ``first`` to ``last`` - 1, sixteen at a time from ``base`` on.
+"""Head of a loop over the Gaussians ``first`` to ``last`` - 1, sixteen at a time from ``base``.
 
 The function that uses it closes the loop. It needs ``view`` and the arrays of the cloud.
 """

@@ -1,4 +1,4 @@
-"""Projection on a CPU: sixteen Gaussians at a time, as ``projection.project_kernel`` projects one.
+"""Projection on a CPU: sixteen Gaussians at a time, with the equations of ``projection.project_kernel``.
 
 Host code: ``egs_warp/render/projection.py``.
 """
@@ -14,7 +14,7 @@ from egs_warp.kernels.render.vector_math import TILE_SPANS, on_cpu
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = wp.constant(64)
-"""Number of Gaussians that a thread projects per row of a launch."""
+"""Number of Gaussians in a row of a launch."""
 
 
 @wp.func_native(

@@ -27,7 +27,7 @@ def compact_visible_kernel(
     count = wp.int32(0)
     before = wp.int64(0)
     for g in range(slot_end.shape[0]):
-        # Always written, because the branch could not be predicted.
+        # Written for invisible Gaussians, too, because a branch would often be mispredicted.
         depth_out[count] = colour_depth[g][3]
         gaussian_out[count] = g
         end = slot_end[g]
@@ -70,7 +70,7 @@ def split_ranks_kernel(
 
 _TILES_OF_CHUNK = """
     constexpr int AHEAD = 12;
-    // Up to four entries after those of a chunk are overwritten.
+    // Up to four spare entries after those of a chunk are written.
     auto tiles_of = [&](int chunk) -> int* { return &tile_from_pair.data[pair_start.data[chunk] + 4 * chunk]; };
 """
 
@@ -85,8 +85,8 @@ _TILES_OF_CHUNK = """
     const i4 steps = {0, 1, 2, 3};
     int* const tiles = tiles_of(chunk);
     int* tile_out = tiles;
-    // Spans are computed for several Gaussians before any is used, and four tiles are always written, because the
-    // numbers of rows and columns could not be predicted.
+    // Spans are computed for several Gaussians before any of them is used, and tiles are written four at a time,
+    // because branches on the numbers of rows and columns would often be mispredicted.
     constexpr int CAPACITY = 64;
     i4 first_tile[CAPACITY], counts_of_row[CAPACITY];
     int rank = chunk_start.data[chunk], row = 1, last_row = 0;

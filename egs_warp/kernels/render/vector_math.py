@@ -39,7 +39,7 @@ EXP_AND_LOG = """
         #pragma clang fp contract(fast)
         const f16 t = x > -87.0f ? (x < 87.0f ? x : f16(87.0f)) : f16(-87.0f);
         const f16 whole = __builtin_elementwise_roundeven(t * LOG2_E);
-        // The second constant is what LOG2_E lacks.
+        // The second constant is the rounding error of LOG2_E.
         return power_of_two(whole, (t * LOG2_E - whole) + t * 1.9259629e-8f);
     };
     // ln x to 1e-7, for a normal x > 0; the polynomial is that of the Cephes library.

@@ -2,8 +2,8 @@
 
 export const MARK_GLSL = /* glsl */ `
 /* Colour c of a splat: lit if it belongs to the object number lit, darker for another object, dim for none. Nothing
-   changes while lit is negative. From 256 on, lit - 256 is the number of a selected body; other splats keep their
-   colours. */
+   changes while lit is negative. If lit is at least 256, the splats of the selected body lit - 256 are brightened, and
+   all others keep their colours. */
 vec3 egsMarked(vec3 c, sampler2D marks, int index, int lit) {
   if (lit < 0) return c;
   int label = int(egsTexel(marks, index).r * 255.0 + 0.5);

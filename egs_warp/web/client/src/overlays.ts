@@ -79,7 +79,7 @@ export class Overlays {
     if (this.visible.has("path")) this.drawPath(frame, frames);
   }
 
-  /** Compute the path of the centre of mass again, because it belongs to another body. */
+  /** Discard the path of the centre of mass, for example because another body is selected. */
   resetPath(): void {
     this.path = new WeakMap();
   }

@@ -30,7 +30,7 @@ export const SHADOW_GLSL = /* glsl */ `
 /* Fraction of light at uv of a shadow map. Its red channel is the part of the sky that the body hides, its green
    channel marks the parts of the body close to the ground, its blue channel is the shadow of the main light. The
    shadows around a contact and of the light are spread over the radius softness. Coarser levels of the map smooth the
-   few samples. spread is the side of the map for one body of the same height, divided by the side of the map. */
+   few samples. spread is the side of a map for one body of the same height, divided by the side of this map. */
 float egsShade(sampler2D shade, vec2 uv, float softness, float spread) {
   vec2 near = vec2(0.0);
   float wide = 0.0;

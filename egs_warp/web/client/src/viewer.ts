@@ -15,7 +15,7 @@ const GROUND_CHANGE = 0.02;
 const RISE_PER_FRAME = 0.1;
 /** Half of the height that a view of only the body shows, in body heights. */
 const HALF_VIEW_HEIGHT = 1;
-/** Number from which the active mark is that of a selected body (`egsMarked`). */
+/** Offset of the marks of selected bodies (`egsMarked`). */
 const SELECTED = 256;
 export type Preset = "film" | "front" | "side" | "top";
 export type LayerToggle = Layer | "splats" | "scene" | "ground";

@@ -1,0 +1,224 @@
+"""The energy whose minimum is the object that clicks in photos describe, minimised by a graph cut over supervoxels.
+
+It is a conditional random field on the surface of the capture. ``benchmarks/fit_clicks.py`` fits its weights. See
+docs/concepts/segmentation.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.height_field import HeightField
+from egs_warp.geometry.plane import Plane
+from egs_warp.segmentation.framing import picture_radii
+from egs_warp.segmentation.graph_cut import SplatGraph
+from egs_warp.segmentation.plane_search import lies_along
+from egs_warp.segmentation.surface_graph import SurfaceGraph
+
+
+@dataclass(frozen=True)
+class EnergyWeights:
+    """Weights of the energy, fitted by ``benchmarks/fit_clicks.py``."""
+
+    links: tuple[float, ...] = (0.462, 1.646, 0.510, 0.341, 0.038)
+    """Weights of contrast, concavity, convexity, turn and gap in the log-odds that a link crosses a boundary."""
+    link_bias: float = -5.992
+    nodes: tuple[float, ...] = (-3.35, -4.08, -0.34, -8.78, -7.29)
+    """Weights of the logarithm of the surface distance, of lying on the ground, of being below it, of the distance from
+    the middle of the photos, and of being outside their frames in the log-odds that a supervoxel is the object's."""
+    node_bias: float = 3.01
+    smoothness: float = 0.015
+    """Weight of the links: the energy of a boundary of unit length relative to that of unit area."""
+    colour: float = 1.0
+    """Weight of the log-likelihood ratio of the colours."""
+    opposite: float = 2.0
+    """Weight of the logarithm of the ratio of the distances from clicks of both kinds."""
+    correction: float = 3.0
+    """Factor of the distance from clicks on the object after the first one, which correct smaller parts."""
+    crossing: float = 0.1
+    """Additional length of a path where it certainly crosses a boundary, in picture radii."""
+
+
+WEIGHTS = EnergyWeights()
+_GAP_DETOUR = 5.0
+"""Additional length of a path in empty space, relative to its true length there."""
+_SIGMAS = 3.0
+"""Visible half-length of a Gaussian in standard deviations; its far end is farther from a click by this length."""
+_NEAREST = 0.02
+"""Radius about a click, in picture radii, within which distances do not matter."""
+_FOOT = 0.1
+"""Height, in picture radii, to which a ground is uneven: the evidence of lying flat decays over it."""
+_CLEAR = 5.0
+"""Maximum absolute log-odds of a supervoxel."""
+_MAX_WIDTH = 0.1
+"""Maximum width of a Gaussian in the measure of areas and lengths, in picture radii."""
+_BINS, _BLUR, _MAX_COLOUR_RATIO = 12, 0.7, 3.0
+"""Bins of a colour channel in the histograms, their blur in bins, and the maximum log-likelihood ratio."""
+_NEARBY = 2.0
+"""Surface distance from the clicks, in picture radii, within which surroundings have a say about colours."""
+_ROUNDS = 3
+"""Maximum number of times the colour models are fitted."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The evidence of clicks, photos and ground for each supervoxel."""
+
+    included: np.ndarray
+    """(k,) bool, supervoxels that clicks on the object hit."""
+    excluded: np.ndarray
+    """(k,) bool, supervoxels that clicks beside the object hit."""
+    features: np.ndarray
+    """(k, 5) factors of ``EnergyWeights.nodes``."""
+    opposition: np.ndarray
+    """(k,) at least 0, logarithm of the ratio of the surface distances from the clicks on the object and beside it."""
+    nearby: np.ndarray
+    """(k,) bool, supervoxels that train the colour models."""
+    area: np.ndarray
+    """(k,) area of each supervoxel in squared picture radii."""
+
+
+def picture_scale(point: np.ndarray, cameras: Sequence[Camera]) -> float:
+    """Return the picture radius, half of the shorter side of a photo at the distance of the ``point`` (3,), scene
+    units: the median over the ``cameras``. Photographers fill the picture with the object."""
+    return float(np.median([picture_radii(point[None], camera)[1][0] for camera in cameras]))
+
+
+def boundary_log_odds(surface: SurfaceGraph, weights: EnergyWeights = WEIGHTS) -> np.ndarray:
+    """Return (m,), the log-odds that each link between opaque Gaussians crosses the boundary of an object."""
+    return surface.features.matrix() @ np.array(weights.links) + weights.link_bias
+
+
+def surface_links(surface: SurfaceGraph, scale: float, *, weights: EnergyWeights = WEIGHTS) -> SplatGraph:
+    """Return the links between supervoxels. ``length`` is the length of the path in units of ``scale``, longer where it
+    crosses a boundary or a gap; ``strength`` is the cost of cutting the link."""
+    log_odds = boundary_log_odds(surface, weights)
+    links, own = surface.links, surface.own
+    linked = links.length > 0.0
+    unit = float(np.median(links.length[linked])) if linked.any() else 1.0
+    width = 0.5 * (surface.spacing[links.first] + surface.spacing[links.second]) / scale
+    cost = np.minimum(width, _MAX_WIDTH) * np.maximum(-log_odds, 0.0)
+    low, high = np.sort(own[np.stack([links.first, links.second])].astype(np.int64), axis=0)
+    between = low != high
+    codes, link = np.unique(low[between] * surface.count + high[between], return_inverse=True)
+    first, second = (ends.astype(np.int32) for ends in np.divmod(codes, surface.count))
+    number = np.bincount(link, minlength=len(codes))
+    crossed = np.bincount(link, 1.0 / (1.0 + np.exp(-log_odds[between])), len(codes)) / number
+    gap = np.full(len(codes), np.inf)
+    np.minimum.at(gap, link, unit * surface.features.gap[between])
+    middles = surface.middles()
+    away = np.linalg.norm(middles[first] - middles[second], axis=1)
+    length = (away + _GAP_DETOUR * gap) / scale + weights.crossing * crossed
+    return SplatGraph(surface.count, first, second, length, np.bincount(link, cost[between], len(codes)))
+
+
+def evidence_of(
+    surface: SurfaceGraph,
+    links: SplatGraph,
+    first: np.ndarray,
+    corrections: np.ndarray,
+    others: np.ndarray,
+    ground: Plane | HeightField,
+    scale: float,
+    *,
+    weights: EnergyWeights = WEIGHTS,
+) -> Evidence:
+    """Collect the evidence of clicks.
+
+    Args:
+        surface: the prepared capture.
+        links: its ``surface_links``.
+        first: (s,) int, supervoxels that the first click on the object hits.
+        corrections: (c,) int, supervoxels that later clicks on the object hit.
+        others: (t,) int, supervoxels that clicks beside the object hit.
+        ground: the ground.
+        scale: the picture radius, scene units.
+        weights: the weights of the energy.
+    """
+    paths = _paths(links, first)
+    if len(corrections):
+        paths = np.minimum(paths, weights.correction * _paths(links, corrections))
+    opposition = np.zeros(surface.count)
+    if len(others):
+        opposition = np.maximum(np.log((paths + _NEAREST) / (_paths(links, others) + _NEAREST)), 0.0)
+    lengths = np.exp(surface.cloud.log_scales.numpy()[surface.nodes].max(axis=1).astype(np.float64))
+    reach = _SIGMAS * surface.per_cluster(lengths) / scale
+    heights = surface.per_cluster(ground.heights(surface.means[surface.nodes])) / scale
+    level = surface.per_cluster(lies_along(surface.cloud, ground)[surface.nodes].astype(np.float64))
+    off_middle, outside = _framing(surface, first)
+    columns = (
+        np.log(paths + reach + _NEAREST),
+        level * np.exp(-np.maximum(heights, 0.0) / _FOOT),
+        (heights < 0.0).astype(np.float64),
+        np.maximum(off_middle + reach, 0.0),
+        outside,
+    )
+    included, excluded = np.zeros((2, surface.count), bool)
+    included[first], included[corrections], excluded[others] = True, True, True
+    area = np.bincount(surface.own, np.minimum(surface.spacing / scale, _MAX_WIDTH) ** 2, surface.count)
+    return Evidence(included, excluded, np.stack(columns, axis=1), opposition, paths < _NEARBY, area)
+
+
+def minimise(
+    surface: SurfaceGraph, links: SplatGraph, evidence: Evidence, *, weights: EnergyWeights = WEIGHTS
+) -> np.ndarray:
+    """Return (k,) bool, the supervoxels of the object: the minimum of the energy.
+
+    Minimum cuts alternate with new colour models of the object and of its surroundings, as in GrabCut (Rother,
+    Kolmogorov and Blake 2004).
+    """
+    log_odds = np.clip(evidence.features @ np.array(weights.nodes) + weights.node_bias, -_CLEAR, _CLEAR)
+    log_odds = np.clip(log_odds - weights.opposite * evidence.opposition, -_CLEAR, _CLEAR)
+    colours = surface.per_cluster(surface.colours)
+    inside = _cut(links, evidence, log_odds, weights)
+    for _ in range(_ROUNDS):
+        ratio = _colour_ratio(colours, evidence.area, inside & evidence.nearby, ~inside & evidence.nearby)
+        # Colour is no reason to keep what is nearer to a click beside the object, such as a toy of the same colour.
+        ratio = np.where(evidence.opposition > 0.0, np.minimum(ratio, 0.0), ratio)
+        again = _cut(links, evidence, log_odds + weights.colour * np.where(evidence.nearby, ratio, 0.0), weights)
+        if (again == inside).all():
+            break
+        inside = again
+    return inside
+
+
+def _cut(links: SplatGraph, evidence: Evidence, log_odds: np.ndarray, weights: EnergyWeights) -> np.ndarray:
+    """Return (k,) bool, the minimum cut; scores and costs are scaled to a common range, because they are rounded."""
+    score = evidence.area * log_odds
+    unit = 1.0 / max(float(np.mean(np.abs(score))), 1e-30)
+    return links.cut(unit * score, evidence.included, evidence.excluded, smoothness=unit * weights.smoothness)
+
+
+def _paths(links: SplatGraph, seeds: np.ndarray) -> np.ndarray:
+    """Return (k,), the lengths of the shortest paths from the ``seeds``; a large number for unreachable nodes."""
+    paths = links.distances(seeds)
+    return np.where(np.isfinite(paths), paths, 10.0)
+
+
+def _framing(surface: SurfaceGraph, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (k,), the distance of each supervoxel from the middle of the photos, less the mean distance of the
+    ``seeds``, and (k,), the share of the photos that do not show it within a picture radius. Distances are in picture
+    radii."""
+    radii = np.stack([picture_radii(surface.middles(), camera)[0] for camera in surface.cameras])
+    mean = np.minimum(radii, 2.0).mean(axis=0)
+    return mean - float(mean[seeds].mean()), (radii >= 1.0).mean(axis=0)
+
+
+def _colour_ratio(colours: np.ndarray, area: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return (k,), the log-likelihood ratio of each of the ``colours`` (k, 3) under the smoothed histograms of two sets
+    (k,) bool of supervoxels; zero if one of them is empty."""
+    cell = np.ravel_multi_index(np.minimum((colours * _BINS).astype(int), _BINS - 1).T, (_BINS,) * 3)
+    densities = []
+    for side in (own, other):
+        total = float(area[side].sum())
+        if total <= 0.0:
+            return np.zeros(len(colours))
+        counts = np.bincount(cell[side], area[side], _BINS**3).reshape((_BINS,) * 3)
+        densities.append(ndimage.gaussian_filter(counts, _BLUR, mode="nearest").ravel()[cell] / total)
+    ratio = np.log((densities[0] + 1e-4) / (densities[1] + 1e-4))
+    return np.clip(ratio, -_MAX_COLOUR_RATIO, _MAX_COLOUR_RATIO)

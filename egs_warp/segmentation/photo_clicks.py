@@ -1,0 +1,117 @@
+"""The object of a point or of clicks in a capture whose photos are known. See docs/concepts/segmentation.md."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
+from egs_warp.geometry.plane import Plane
+from egs_warp.segmentation.above_plane import SceneAbovePlane
+from egs_warp.segmentation.click_energy import evidence_of, minimise, picture_scale, surface_links
+from egs_warp.segmentation.clicks import Click
+from egs_warp.segmentation.framing import MIN_PHOTOS, is_in_frame
+from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.segmentation.surface_graph import SurfaceGraph
+
+_SEED_COUNT = 8
+"""Number of Gaussians next to a point that represent a click there."""
+_MAX_WIDTH = 0.05
+"""Maximum standard deviation of a hit that is a hard constraint, in picture radii."""
+
+
+@dataclass(frozen=True)
+class ClicksInPhotos(ObjectSpec):
+    """A point or clicks in a capture with photos that show the object."""
+
+    surface: SurfaceGraph | None = None
+    """The capture prepared for the clicks."""
+
+
+def with_photos(
+    cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camera], *, surface: SurfaceGraph | None = None
+) -> ObjectSpec:
+    """Return ``spec`` with ``cloud`` prepared for its point or clicks, if at least eight photos show the point. Masks
+    and boxes are more precise, so they are unchanged.
+
+    Args:
+        cloud: the capture.
+        spec: the user's description of the object.
+        cameras: cameras of the photos.
+        surface: the capture prepared before; None to prepare it.
+    """
+    if spec.point is None or spec.masks:
+        return spec
+    showing = [camera for camera in cameras if is_in_frame(spec.point[None], camera)[0]]
+    if len(showing) < MIN_PHOTOS:
+        return spec
+    surface = surface or SurfaceGraph.of(cloud, showing)
+    return ClicksInPhotos(spec.masks, spec.box, spec.point, spec.clicks, spec.picked, surface)
+
+
+def picked_in_photos(spec: ClicksInPhotos, scene: SceneAbovePlane) -> ClicksInPhotos:
+    """Return ``spec`` with the Gaussians that its point and clicks describe as ``picked``, and with only the certain
+    hits of its clicks. Raises ``UserError`` if nothing of the object is above the plane."""
+    surface, point = spec.surface, spec.point
+    assert surface is not None and point is not None
+    solid = scene.is_opaque & (scene.heights > 0.0)
+    clicks = tuple(_certain(surface, click) for click in spec.clicks)
+    spec = replace(spec, clicks=clicks)
+    if not any(click.inside for click in clicks) and solid.any():
+        standing = np.flatnonzero(solid)
+        nearest = KDTree(scene.means[standing]).query(point, k=min(_SEED_COUNT, len(standing)))[1]
+        clicks = (Click(point, standing[np.ravel(nearest)]), *clicks)
+    found = object_of_clicks(surface, clicks, scene.plane)
+    if not (found & solid).any():
+        raise UserError(
+            "object: nothing of it lies above the plane around the clicks; click on more of it, mark it with masks, or"
+            " give its plane",
+            check=("plane",),
+        )
+    return replace(spec, picked=found)
+
+
+def _certain(surface: SurfaceGraph, click: Click) -> Click:
+    """Return a ``click`` on the object without the hits that are much wider than a click, unless all are: the edge of a
+    Gaussian of the wall behind the object may paint the clicked pixel. A click beside the object is unchanged."""
+    if not click.inside or not len(click.hits):
+        return click
+    lengths = np.exp(surface.cloud.log_scales.numpy()[click.hits].max(axis=1))
+    widths = lengths / picture_scale(click.point, surface.cameras)
+    return replace(click, hits=click.hits[widths <= max(_MAX_WIDTH, float(widths.min()))])
+
+
+def object_of_clicks(surface: SurfaceGraph, clicks: Sequence[Click], ground: Plane | HeightField) -> np.ndarray:
+    """Find the Gaussians of the object that the clicks describe: the minimum of the energy of ``click_energy``.
+
+    Args:
+        surface: the prepared capture.
+        clicks: clicks on the object and beside it. The first one on the object defines where the photos show it; later
+            ones correct the result. A supervoxel that both kinds hit belongs to the later click.
+        ground: the ground, in the frame of the capture.
+
+    Returns:
+        (n,) bool, True for the object's Gaussians; all False without a click on the object.
+    """
+    kind = np.zeros(surface.count, np.int8)
+    for click in clicks:
+        kind[surface.cluster[click.hits]] = 1 if click.inside else -1
+    seeds = np.flatnonzero(kind == 1)
+    if len(seeds) == 0:
+        return np.zeros(len(surface.means), bool)
+    own = next(click for click in clicks if click.inside)
+    is_first = np.isin(seeds, surface.cluster[own.hits])
+    first, corrections = (seeds[is_first], seeds[~is_first]) if is_first.any() else (seeds, seeds[:0])
+    scale = picture_scale(own.point, surface.cameras)
+    links = surface_links(surface, scale)
+    evidence = evidence_of(surface, links, first, corrections, np.flatnonzero(kind == -1), ground, scale)
+    chosen = minimise(surface, links, evidence)[surface.cluster]
+    for click in clicks:
+        chosen[click.hits] = kind[surface.cluster[click.hits]] == 1
+    return chosen

@@ -1,0 +1,141 @@
+"""The object of clicks in a capture with photos: the minimum of the energy, on a ball that touches other things."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
+from egs_warp.geometry.plane import Plane
+from egs_warp.segmentation.clicks import Click, click_at
+from egs_warp.segmentation.object_mask import segment
+from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.segmentation.photo_clicks import object_of_clicks, with_photos
+from egs_warp.segmentation.surface_graph import SurfaceGraph
+from egs_warp.segmentation.votes import MaskedView
+from tests.support.grounds import level, sheet
+from tests.support.scenes import FLOOR, lying, shell
+
+BALL = 1500
+UP = np.array([0.0, 0.0, 1.0])
+FRONT = (0.0, -0.5, 0.5)
+
+
+def ball(middle: float, colour: tuple[float, float, float]) -> GaussianCloud:
+    """Return a ball of diameter 1 on the floor, at ``middle`` on the x axis."""
+    skin = shell(BALL)
+    return sheet(skin + [middle, 0.0, 0.0], 2.0 * (skin - [0.0, 0.0, 0.5]), 0.045, colour)
+
+
+def photos(count: int, distance: float = 2.2) -> list[Camera]:
+    """Return cameras in an arc in front of the ball at the origin, which fills their pictures."""
+    middle = np.array([0.0, 0.0, 0.5])
+    angles = np.radians(np.linspace(-150.0, -30.0, count))
+    eyes = [middle + distance * np.array([np.cos(angle), np.sin(angle), 0.5]) for angle in angles]
+    return [Camera.look_at(eye, middle, UP, width=160, height=120, vertical_fov_degrees=45.0) for eye in eyes]
+
+
+def click(cloud: GaussianCloud, point: tuple[float, float, float], *, inside: bool = True) -> Click:
+    """Return a click on ``point`` in the middle one of nine photos."""
+    camera = photos(9)[4]
+    x, y, z = camera.rotation @ np.array(point) + camera.translation
+    hit = click_at(cloud, camera, camera.cx + camera.fx * x / z, camera.cy + camera.fy * y / z, inside=inside)
+    assert hit is not None
+    return hit
+
+
+@pytest.fixture(scope="module")
+def against_wall() -> GaussianCloud:
+    """Create a ball that touches a long wall behind it, both on a floor."""
+    wall = level((-4.0, 0.03), (4.0, 2.0), 0.5, 0.06)[:, [0, 2, 1]]
+    floor = lying(level((-4.0, -2.0), (4.0, 0.5), 0.0, 0.06))
+    upright = sheet(wall, np.tile([0.0, -1.0, 0.0], (len(wall), 1)), 0.06, (0.3, 0.5, 0.6))
+    return concatenate(ball(0.0, (0.8, 0.2, 0.1)), upright, floor)
+
+
+@pytest.fixture(scope="module")
+def twins() -> GaussianCloud:
+    """Create two touching balls of one colour on a floor."""
+    floor = lying(level((-2.0, -1.5), (2.0, 1.5), 0.0, 0.06))
+    return concatenate(ball(0.0, (0.8, 0.2, 0.1)), ball(1.0, (0.8, 0.2, 0.1)), floor)
+
+
+def test_a_wall_behind_the_object_is_left_out(against_wall: GaussianCloud) -> None:
+    """The wall is connected to the ball, so a point alone selects both; with photos, it selects the ball."""
+    alone = ObjectSpec(point=np.array(FRONT))
+    heights = against_wall.means.numpy()[:, 2]
+    own = (np.arange(against_wall.count) < BALL) & (heights > 0.1)
+    wall = (np.arange(against_wall.count) >= BALL) & (heights > 0.1)
+    both = segment(against_wall, FLOOR, alone).object_mask
+    assert both[own].mean() > 0.99 and both[wall].mean() > 0.95
+    found = segment(against_wall, FLOOR, with_photos(against_wall, alone, photos(9))).object_mask
+    assert found[own].mean() > 0.95 and found[wall].mean() < 0.02
+
+
+def test_a_concave_crease_separates_two_balls_of_one_colour(twins: GaussianCloud) -> None:
+    surface = SurfaceGraph.of(twins, photos(9))
+    chosen = object_of_clicks(surface, [click(twins, FRONT)], FLOOR)
+    assert chosen[:BALL].mean() > 0.9 and chosen[BALL : 2 * BALL].mean() < 0.2
+
+
+def test_a_second_click_adds_and_a_click_beside_removes(twins: GaussianCloud) -> None:
+    surface = SurfaceGraph.of(twins, photos(9, 3.5))
+    first, right = click(twins, FRONT), click(twins, (0.75, -0.43, 0.5))
+    off = replace(right, inside=False)
+    added, removed = (object_of_clicks(surface, [first, other], FLOOR) for other in (right, off))
+    assert added[right.hits].all() and added[BALL : 2 * BALL].mean() > 0.5
+    assert not removed[off.hits].any() and removed[BALL : 2 * BALL].mean() < 0.2
+    assert removed[:BALL].mean() > 0.9
+
+
+def test_of_opposite_clicks_on_one_place_the_later_one_counts(twins: GaussianCloud) -> None:
+    surface = SurfaceGraph.of(twins, photos(9))
+    plus, minus = (click(twins, FRONT, inside=inside) for inside in (True, False))
+    assert not object_of_clicks(surface, [plus, minus], FLOOR).any()
+    assert object_of_clicks(surface, [minus, plus], FLOOR)[:BALL].mean() > 0.9
+
+
+def test_a_wide_hit_of_a_click_is_no_constraint(against_wall: GaussianCloud) -> None:
+    """A click on the ball that also hits a Gaussian of the wall, four times as wide as a click, does not select it."""
+    spec = with_photos(against_wall, ObjectSpec.of_clicks([click(against_wall, FRONT)]), photos(9))
+    scales = against_wall.log_scales.numpy().copy()
+    scales[BALL + 40] = np.log([0.4, 0.4, 0.01])
+    wide = GaussianCloud.from_numpy(
+        against_wall.means.numpy(),
+        against_wall.rotations.numpy(),
+        scales,
+        against_wall.opacity_logits.numpy(),
+        against_wall.sh.numpy(),
+    )
+    hit = Click(spec.clicks[0].point, np.append(spec.clicks[0].hits, BALL + 40))
+    found = segment(wide, FLOOR, with_photos(wide, ObjectSpec.of_clicks([hit]), photos(9))).object_mask
+    assert found[spec.clicks[0].hits].all() and not found[BALL + 40]
+
+
+def test_the_unit_of_length_changes_nothing(twins: GaussianCloud) -> None:
+    expected = object_of_clicks(SurfaceGraph.of(twins, photos(9)), [click(twins, FRONT)], FLOOR)
+    hit, larger = click(twins, FRONT), twins.scaled(100.0)
+    cameras = [replace(one, translation=100.0 * one.translation, near=100.0 * one.near) for one in photos(9)]
+    again = object_of_clicks(
+        SurfaceGraph.of(larger, cameras), [Click(100.0 * hit.point, hit.hits)], FLOOR.scaled(100.0)
+    )
+    assert (again != expected).mean() < 0.002
+
+
+def test_photos_are_used_only_if_enough_of_them_show_the_point(twins: GaussianCloud) -> None:
+    spec = ObjectSpec(point=np.array(FRONT))
+    assert with_photos(twins, spec, photos(7)) is spec
+    elsewhere = [Camera.look_at(np.array([0.0, 9.0, 1.0]), np.array([0.0, 20.0, 1.0]), UP, width=64, height=48)] * 9
+    assert with_photos(twins, spec, [*photos(7), *elsewhere]) is spec
+    masked = ObjectSpec(masks=(MaskedView(photos(1)[0], np.ones((120, 160), bool), "photo"),))
+    assert with_photos(twins, masked, photos(9)) is masked
+
+
+def test_an_object_below_its_plane_is_reported(twins: GaussianCloud) -> None:
+    spec = with_photos(twins, ObjectSpec.of_clicks([click(twins, FRONT)]), photos(9))
+    with pytest.raises(UserError, match="nothing of it lies above the plane around the clicks; click on more of it"):
+        segment(twins, Plane(UP, -5.0), spec)
