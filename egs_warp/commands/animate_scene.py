@@ -47,7 +47,7 @@ def named_objects(values: Sequence[str] | None) -> dict[str, tuple[str, ...]]:
 
 
 def motions_of(text: str, names: Sequence[str], props: Sequence[str]) -> dict[str, str]:
-    """Return the motion of each creature.
+    """Return the motion of each creature that has one.
 
     Args:
         text: ``a: walk 1; b: nod``, or a motion of all creatures.
@@ -55,11 +55,11 @@ def motions_of(text: str, names: Sequence[str], props: Sequence[str]) -> dict[st
         props: Names of the props.
 
     Raises:
-        UserError: A name is unknown or occurs twice, or names a prop, or a motion is missing.
+        UserError: A name is unknown or occurs twice, or names a prop, or a motion is invalid or empty.
     """
     from egs_warp.motions.towards import check_motion
 
-    parts = [part.strip() for part in text.split(";") if part.strip()]
+    parts = [part.strip() for part in text.split(";") if part.strip()] or [""]
     motions: dict[str, str] = {}
     for part in parts:
         name, colon, motion = (each.strip() for each in part.partition(":"))

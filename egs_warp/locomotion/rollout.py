@@ -73,6 +73,23 @@ def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]
     return frame / count, count
 
 
+def support_report(stepper: LocomotionStepper, report: StepReport) -> StepReport:
+    """Return the ``report`` of a body among others with only the contacts that support the body: those with the ground,
+    and those with other bodies below it. A motion must not treat another body that pushes from the side as its ground.
+    """
+    contacts, up = report.contacts, -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
+    kept = (contacts.faces >= 0) | (contacts.axes[:, 0] @ up > _MIN_SUPPORT_COSINE)
+    contacts = replace(contacts, **{name: value[kept] for name, value in contacts.batched_fields()})
+    gaps, _ = stepper.detector.gaps(report.state.positions)
+    return replace(
+        report,
+        contacts=contacts,
+        forces=report.forces[kept],
+        end_gaps=report.end_gaps[kept],
+        min_gap=float(gaps.min()),
+    )
+
+
 class BodyRun:
     """Progress of one body in a run: its state, warm start, reports and recording."""
 
@@ -95,7 +112,6 @@ class BodyRun:
         ``has_others`` is True in a world with other bodies.
         """
         self.stepper, self._motion, self._kicks, self._has_others = stepper, motion, kicks, has_others
-        self._up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
         self.state, self.memory = start, stepper.initial_memory()
         self.reports: list[StepReport] = []
         self._shown = [0]
@@ -120,28 +136,10 @@ class BodyRun:
     def objectives(self, dt: float) -> Sequence[AnyObjective]:
         """Return the objectives of the motion for the next step of ``dt`` s."""
         with one_blas_thread():
-            report = self._support_report() if self.reports else None
+            report = self.reports[-1] if self.reports else None
+            if report is not None and self._has_others:
+                report = support_report(self.stepper, report)
             return self._motion.objectives(self.state, report, dt)
-
-    def _support_report(self) -> StepReport:
-        """Return the last report with only the contacts that support the body: those with the ground, and those with
-        other bodies below it. A motion must not treat another body that pushes from the side as its ground."""
-        report = self.reports[-1]
-        if not self._has_others:
-            return report
-        contacts = report.contacts
-        kept = (contacts.faces >= 0) | (contacts.axes[:, 0] @ self._up > _MIN_SUPPORT_COSINE)
-        contacts = replace(contacts, **{name: value[kept] for name, value in contacts.batched_fields()})
-        # The weights of a point of another body sum to -1.
-        weights = contacts.weights / contacts.weights.sum(axis=1, keepdims=True)
-        gaps, _ = self.stepper.detector.gaps(report.state.positions)
-        return replace(
-            report,
-            contacts=replace(contacts, weights=np.where(contacts.faces[:, None] < 0, weights, contacts.weights)),
-            forces=report.forces[kept],
-            end_gaps=report.end_gaps[kept],
-            min_gap=float(gaps.min()),
-        )
 
     def begin_step(
         self, objectives: Sequence[AnyObjective], dt: float, activations: np.ndarray | None = None

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
@@ -15,7 +14,7 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
 from egs_warp.motions.other_body import OtherBody
-from egs_warp.motions.sequence import JudgedOutcome, Stance
+from egs_warp.motions.sequence import JudgedOutcome, Stance, TargetError
 
 _OVERLAP = 0.8
 """Distance from the path to the middle of the other body, relative to the distance at which its top and the base of the
@@ -49,7 +48,7 @@ class Kick:
             target: distance and height of the jump, m.
 
         Raises:
-            UserError: if the other body is out of reach of the jump.
+            TargetError: if the other body is out of reach of the jump.
         """
         self.body, self._other, self._name = stance.body, other, name
         ground = stance.ground
@@ -62,7 +61,7 @@ class Kick:
         offset = _OVERLAP * (own_radius + float(np.linalg.norm(top, axis=1).max()))
         distance, height = float(np.linalg.norm(centre)), stance.body.height
         if not offset < distance < target.distance:
-            raise UserError(
+            raise TargetError(
                 f"kick: {name} is {distance / height:.2f} body heights away; walk or jump to a distance between"
                 f" {offset / height:.2f} and {target.distance / height:.2f}"
             )

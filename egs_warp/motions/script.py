@@ -24,7 +24,7 @@ from egs_warp.motions.command import Drive, DrivePlan
 from egs_warp.motions.keyframes import Key, checked_keys
 from egs_warp.motions.repertoire import MOTIONS, MotionKind, frames_of_request, kind_of_request, tasks_of_request
 from egs_warp.motions.request import LayerRequest, MotionRequest
-from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance
+from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance, TargetError
 from egs_warp.motions.style import Style, read_style
 from egs_warp.motions.values import Value
 
@@ -96,12 +96,22 @@ class Script:
         return Script((*self.requests[:index], gentler, *self.requests[index + 1 :])), change
 
     def check(self, stance: Stance) -> list[float]:
-        """Return the expected duration in seconds of each motion, for a body that stands at ``stance``.
+        """Return the expected duration in seconds of each motion, for a body that stands at ``stance``; 0 if it can
+        only be computed where the motion starts.
 
         Raises:
-            UserError: if one of the motions cannot start.
+            UserError: if one of the motions cannot start. The target of a later motion may be out of reach from
+                ``stance``, because the earlier motions move the body.
         """
-        return [part.begin(stance).expected_time for part in self.parts(stance.body.height)]
+        expected = []
+        for number, part in enumerate(self.parts(stance.body.height)):
+            try:
+                expected.append(part.begin(stance).expected_time)
+            except TargetError:
+                if number == 0:
+                    raise
+                expected.append(0.0)
+        return expected
 
 
 def motion(text: str, *, beats: str | None = None, **values: float | None) -> Script:

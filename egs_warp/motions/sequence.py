@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from egs_warp.contact.terrain import Surface, surface_above
+from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.geometry.plane import Plane
@@ -128,6 +129,10 @@ class Stance:
         x, y = self.ground.axes[:2] @ direction
         turn = self.ground.rotation_about_up(float(np.arctan2(y, x)))
         return replace(self, ground=replace(self.ground, axes=self.ground.axes @ turn.T))
+
+
+class TargetError(UserError):
+    """Target that a body cannot reach from where it stands when the motion starts."""
 
 
 @dataclass(frozen=True)

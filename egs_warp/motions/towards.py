@@ -22,7 +22,7 @@ from egs_warp.motions.repertoire import MOTIONS, frames_of_request, tasks_of_req
 from egs_warp.motions.request import MAX_TARGET, MotionRequest
 from egs_warp.motions.script import Script
 from egs_warp.motions.script import motion as script
-from egs_warp.motions.sequence import BodyMotion, Stance
+from egs_warp.motions.sequence import BodyMotion, Stance, TargetError
 from egs_warp.motions.stand import StandFor
 from egs_warp.motions.steering import Policy, Steered, is_blocked
 from egs_warp.motions.steering_targets import AvoidBody, FollowBody, PushTo, WalkToBody, WalkToPoint
@@ -251,16 +251,16 @@ def _of_registry(name: str, values: Mapping[str, float], stance: Stance) -> Body
 def _steered(
     policy: Policy, others: Mapping[str, OtherBody], stance: Stance, what: str, *, goal: np.ndarray | None = None
 ) -> Steered:
-    """Return a steered walk. Raises ``UserError`` if its ``goal`` (2,) m is in an obstacle or in a body."""
+    """Return a steered walk. Raises ``TargetError`` if its ``goal`` (2,) m is in an obstacle or in a body."""
     height = stance.body.height
     if goal is not None:
         where = f"{goal[0] / height:.2f} ahead and {goal[1] / height:.2f} to the left"
         if is_blocked(stance, goal, radius_of(stance.ground.local(stance.standing))):
-            raise UserError(f"{what}: there is an obstacle at the target, {where}; give a target beside it")
+            raise TargetError(f"{what}: there is an obstacle at the target, {where}; give a target beside it")
         # Only props stay where they are.
         for name, other in others.items():
             centre, touching = other.place(stance)
             if other.body.mesh.tets.shape[0] == 1 and np.linalg.norm(centre - goal) < touching:
-                raise UserError(f"{what}: {name} is at the target, {where}; give a target beside it")
+                raise TargetError(f"{what}: {name} is at the target, {where}; give a target beside it")
     expected = 10.0 * stance.body.time_unit
     return Steered(stance, others, policy, expected_time=expected)

@@ -14,7 +14,7 @@ from egs_warp.locomotion.world_audit import audit_world
 from egs_warp.motions.stance import REST_SPEED
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.finished_run import PARTS
-from egs_warp.pipelines.finished_world import SHAPE
+from egs_warp.pipelines.finished_world import SHAPE, scene_facts
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run, write_report
 from egs_warp.pipelines.shot import Shot, resized
@@ -84,7 +84,8 @@ def write_world(
         shapes = [body.shape for body in filmed.bodies.values()]
         audit = audit_world([result.simulation.trajectory for result in run.results], shapes)
         video = draw_world_film(filmed, camera, folder, shot=shot, shadow=shadow, quiet=quiet) if film else None
-        whole = WorldReport(reports, results, audit, run.stopped, video, tuple(notes), asked or {})
+        scene = scene_facts(run.world)
+        whole = WorldReport(reports, results, audit, run.stopped, video, tuple(notes), asked or {}, scene)
         write_report(folder.file("report.json"), whole.to_json())
         for name in run.bodies:
             shutil.rmtree(folder.path / name / PARTS, ignore_errors=True)

@@ -11,16 +11,20 @@ from typing import Any, Self
 import numpy as np
 
 from egs_warp.contact.terrain import Solid
+from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.io.run_folder import is_interrupted
+from egs_warp.io.capture import read_capture
+from egs_warp.io.run_folder import CONFIG, is_interrupted
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.locomotion.world_audit import ContactShape
 from egs_warp.pipelines.finished_run import FinishedRun, checked_frame
+from egs_warp.pipelines.report import JsonValue
+from egs_warp.pipelines.world import World
 from egs_warp.pipelines.world_film import FilmedBody, FilmedWorld
 from egs_warp.short_repr import short_repr
 
@@ -54,7 +58,8 @@ class FinishedWorld:
     def read(cls, folder: Path) -> Self:
         """Read the ``folder`` of a world. Raises ``UserError`` if it has no finished run of a world."""
         if is_interrupted(folder):
-            raise UserError(f"{folder}: the run has not finished; egs-warp resume {folder} continues it")
+            cure = f"egs-warp resume {folder} continues it" if (folder / CONFIG).is_file() else "start it again"
+            raise UserError(f"{folder}: the run has not finished; {cure}")
         path = folder / "report.json"
         report = parse_json(read_text(path), path)
         names = report.get("bodies") if isinstance(report, dict) else None
@@ -121,20 +126,48 @@ class FinishedWorld:
         )
 
     @cached_property
+    def scene(self) -> GaussianCloud | None:
+        """Captured scene behind the bodies (``background.ply``), in the frame of the world; None if there is none."""
+        file, facts = self.folder / "background.ply", self.report.get("scene")
+        if facts is None or not file.is_file():
+            return None
+        try:
+            frame = BodyFrame(np.array(facts["axes"]), np.array(facts["origin"]), float(facts["metres_per_unit"]))
+        except (KeyError, TypeError, ValueError) as error:
+            path = self.folder / "report.json"
+            raise UserError(f"{path}: its scene is invalid; run egs-warp animate again to write it") from error
+        return to_body_frame(read_capture(file).cloud, frame)
+
+    @cached_property
     def filmed(self) -> FilmedWorld:
-        """The bodies, ready to be drawn."""
+        """The bodies, ready to be drawn. A scene shows its own obstacles, so only the others are drawn."""
         count = self.frame_count
+        solids = self.solids if self.scene is None else self.solids[: int(self.report["scene"]["drawn_obstacles"])]
         bodies = {
             name: FilmedBody(run.deformer(), run.trajectory, run.steps[:count], self.shapes[name])
             for name, run in self.bodies.items()
         }
-        return FilmedWorld(bodies, self.solids)
+        return FilmedWorld(bodies, solids, self.scene, self.first.trajectory.ground_coefficients.size == 0)
 
     def splats_of(self) -> Callable[[int], GaussianCloud]:
         """Return the function for the splats of all bodies in a frame; each call overwrites its last result."""
         filmed = self.filmed
         deformer = filmed.joint_deformer()
         return lambda frame: deformer.deform(filmed.poses(frame)).cloud
+
+
+def scene_facts(world: World) -> dict[str, JsonValue] | None:
+    """Return the facts of the report with which ``FinishedWorld.scene`` places the scene of a world; None without
+    one."""
+    if world.surroundings is None:
+        return None
+    frame = world.surroundings.frame
+    return {
+        "axes": frame.axes.tolist(),
+        "origin": frame.origin.tolist(),
+        "metres_per_unit": float(frame.scale),
+        "drawn_obstacles": len(world.solids),
+    }
 
 
 def read_finished(folder: Path, *, background: Path | None = None) -> FinishedRun | FinishedWorld:

@@ -85,6 +85,8 @@ class WorldJobResult:
         """Worst state of all bodies; None if the job failed."""
         if self.error is not None:
             return None
+        if any(body.stopped for body in self.bodies.values()):
+            return State.STOPPED
         return State.worst(tuple(body.report.state for body in self.bodies.values()))
 
 

@@ -75,7 +75,7 @@ def render_run(
     if isinstance(run, FinishedWorld):
         motion: FilmedMotion = run.filmed.motion()
         last = np.arange(run.frame_count)
-        camera, in_scene = run.camera, False
+        camera, in_scene = run.camera, run.scene is not None
         steps = film_steps(run.filmed, shot)
     else:
         motion, last = run.trajectory, run.steps

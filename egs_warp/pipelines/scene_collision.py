@@ -32,13 +32,15 @@ _CELLS = 24
 """Number of cells along the longest side of a part that is not convex."""
 _BOXES_OF_PART = 16
 """Maximum number of boxes that replace a part that is not convex."""
+_MIN_RADIUS = 1e-6
+"""Minimum radius of a ball inside a solid that is written, relative to the measured box."""
 _SAME_PLANE = 1e-4
 """Maximum difference of the normals, and of the offsets relative to the size, of faces in one plane."""
 
 
 def write_collision_mesh(path: Path | str, obstacles: SceneObstacles, frame: BodyFrame) -> None:
     """Write obstacles and ground as a .glb in the frame and units of the capture: a mesh for each solid, and an open
-    mesh named ``ground``.
+    mesh named ``ground``. Parts outside the measured box are left out.
 
     Args:
         path: The file.
@@ -46,10 +48,12 @@ def write_collision_mesh(path: Path | str, obstacles: SceneObstacles, frame: Bod
         frame: Frame of the world in the capture.
     """
     parts = [TriangleMesh(GROUND_NAME, *_ground_mesh(obstacles))]
+    bounds = box_between(obstacles.low, obstacles.high)
+    least = _MIN_RADIUS * float((obstacles.high - obstacles.low).max())
     for number, solid in enumerate(obstacles.solids, start=1):
-        bounds = box_between(obstacles.low, obstacles.high)
-        vertices, faces = solid_mesh(Solid((*solid.faces, *bounds.faces)))
-        parts.append(TriangleMesh(f"solid-{number}", vertices, faces))
+        bounded = Solid((*solid.faces, *bounds.faces))
+        if _inner_ball(_rows(bounded))[1] > least:
+            parts.append(TriangleMesh(f"solid-{number}", *solid_mesh(bounded)))
     write_triangle_glb(
         path, [TriangleMesh(each.name, frame.capture_points(each.vertices), each.faces) for each in parts]
     )
@@ -77,24 +81,29 @@ def read_collision_mesh(path: Path | str) -> tuple[Solid, ...]:
 
 def solid_mesh(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
     """Return the vertices (V, 3) and triangles (F, 3), wound outwards, of a bounded solid."""
-    rows = np.array([[*face.normal, face.offset] for face in solid.faces])
-    corners = HalfspaceIntersection(rows, _inner_point(rows)).intersections
+    rows = _rows(solid)
+    corners = HalfspaceIntersection(rows, _inner_ball(rows)[0]).intersections
     hull = ConvexHull(corners)
     used, faces = np.unique(hull.simplices, return_inverse=True)
     return corners[used], _outward(corners[used], faces.reshape(-1, 3))
 
 
-def _inner_point(rows: np.ndarray) -> np.ndarray:
-    """Return the centre (3,) of the largest ball inside the half spaces ``rows`` (n, 4)."""
+def _rows(solid: Solid) -> np.ndarray:
+    return np.array([[*face.normal, face.offset] for face in solid.faces])
+
+
+def _inner_ball(rows: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the centre (3,) and the radius of the largest ball inside the half spaces ``rows`` (n, 4) of a bounded
+    solid. The radius is 0 or less if they have no common interior."""
     from scipy.optimize import linprog
 
     result = linprog(
         [0.0, 0.0, 0.0, -1.0],
         A_ub=np.column_stack([rows[:, :3], np.ones(len(rows))]),
         b_ub=-rows[:, 3],
-        bounds=[(None, None)] * 3 + [(0.0, None)],
+        bounds=[(None, None)] * 4,
     )
-    return np.asarray(result.x)[:3]
+    return result.x[:3], float(result.x[3])
 
 
 def _outward(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from egs_warp.pipelines.finished_world import FinishedWorld
 from egs_warp.pipelines.usd_body import define_body, define_material, define_surroundings
 
 CREATURE, WORLD = "/creature", "/world"
-_SURROUNDINGS = ("physics", "ground")
+_SURROUNDINGS = ("physics", "ground", "scene")
 """Prims of a world that are not bodies."""
 SPLATS, CAGE, MUSCLES, FORCES, SCENE = "splats", "cage", "muscles", "forces", "scene"
 _WIDTH = 0.004
@@ -86,8 +86,8 @@ def export_usd(
         for index in tqdm(frames, desc="export", unit="frame", disable=quiet):
             for body in bodies:
                 body.write_frame(int(index), is_first=index == 0)
-        if isinstance(run, FinishedRun) and run.scene is not None:
-            scene = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"{CREATURE}/{SCENE}")
+        if run.scene is not None:
+            scene = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"{root}/{SCENE}")
             still = with_degree(run.scene, degree)
             _write_constant(scene, still, Vt)
             _write_sample(scene, still, Usd.TimeCode.Default(), Vt)

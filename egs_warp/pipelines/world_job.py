@@ -32,6 +32,8 @@ class BodyOutcome:
     """(n,) Index of the trajectory's state for each frame of a video at 60 Hz."""
     trajectory: Trajectory
     """All solver steps, in the frame of the world."""
+    stopped: bool
+    """True if the run of the world ended at a step that could not be solved."""
 
 
 WorldSummary: TypeAlias = Mapping[str, BodyOutcome]
@@ -79,5 +81,5 @@ class WorldJob:
         for name, result in run.bodies.items():
             notes = result.unfinished_note() if isinstance(result, SimulatedRun) else ()
             report = report_of_body(result, notes=notes)
-            outcomes[name] = BodyOutcome(report, result.simulation.frames, result.trajectory)
+            outcomes[name] = BodyOutcome(report, result.simulation.frames, result.trajectory, run.stopped)
         return outcomes

@@ -48,6 +48,8 @@ class WorldReport:
     """Notes for the user."""
     asked: Mapping[str, JsonValue] = field(default_factory=dict)
     """Contents of the world file, ready for JSON."""
+    scene: Mapping[str, JsonValue] | None = None
+    """Frame of the world in the capture of its scene, and number of drawn obstacles; None without a scene."""
 
     @property
     def state(self) -> State:
@@ -81,6 +83,7 @@ class WorldReport:
             "audit": {**audit, "pairs": list(audit["pairs"])},
             "verdict": self.verdict(),
             "film": self.film,
+            "scene": None if self.scene is None else dict(self.scene),
             "notes": list(self.notes),
             "asked": dict(self.asked),
             "versions": versions(),

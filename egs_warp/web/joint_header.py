@@ -16,6 +16,7 @@ import scipy.sparse as sp
 
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.joint_deformer import JointDeformer
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.pipelines.drawn_cage import DrawnCage
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.short_repr import short_repr
@@ -55,6 +56,7 @@ def joint_header(
     bodies: Sequence[PageBody],
     planes: np.ndarray,
     *,
+    scene: GaussianCloud | None = None,
     more: Mapping[str, np.ndarray] | None = None,
 ) -> bytes:
     """Return the header of several bodies.
@@ -63,6 +65,7 @@ def joint_header(
         facts: JSON values of the run, as for ``creature_header``.
         bodies: The bodies.
         planes: (P, 4) rows n, d of the ground planes.
+        scene: Background or None.
         more: Further arrays by name.
     """
     nodes, counts = node_starts(bodies), [len(body.cage.nodes) for body in bodies]
@@ -100,7 +103,7 @@ def joint_header(
         ),
         node_mass=np.concatenate([_padded(body.node_mass, count) for body, count in zip(bodies, counts, strict=True)]),
         planes=planes,
-        scene=None,
+        scene=scene,
         more=more,
     )
 

@@ -80,7 +80,9 @@ class WorldFeed:
             "styles": STYLES,
         }
         planes = np.array([[*plane.normal, plane.offset] for plane in bodies[0].geometry.planes])
-        return joint_header(facts, session.page_bodies, planes)
+        surroundings = session.world.surroundings
+        scene = None if surroundings is None else surroundings.cloud
+        return joint_header(facts, session.page_bodies, planes, scene=scene)
 
 
 class WorldPageFeed:
@@ -128,13 +130,14 @@ class WorldPageFeed:
 def live_page_bodies(world: World) -> list[PageBody]:
     """Return the bodies of ``world`` for the page; the Gaussians of creatures are split for likely motions."""
     camera = world_view(world)
-    return [_page_body(member, camera) for member in world.members]
+    hides_ground = world.ground is None and world.surroundings is None
+    return [_page_body(member, camera, hides_ground=hides_ground) for member in world.members]
 
 
-def _page_body(member: PlacedBody, camera: Camera) -> PageBody:
+def _page_body(member: PlacedBody, camera: Camera, *, hides_ground: bool) -> PageBody:
     body = member.body
     if isinstance(body, Creature):
-        splats, feet = presplit_gaussians(body, hides_ground=True), initial_stance(body).feet()
+        splats, feet = presplit_gaussians(body, hides_ground=hides_ground), initial_stance(body).feet()
     else:
         splats, feet = body.cloud, ()
     shape = ContactShape.of(body.geometry, body.shape.level_set, body.mesh.nodes)

@@ -57,7 +57,7 @@ class WorldRecording(FinishedWorld):
             "motion": [],
             "notes": self.report.get("notes", []),
         }
-        return joint_header(facts, self.page_bodies, first.planes)
+        return joint_header(facts, self.page_bodies, first.planes, scene=self.scene)
 
     def frames(self) -> Iterator[Frame]:
         """Yield the frames at 60 Hz."""

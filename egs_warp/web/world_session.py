@@ -18,6 +18,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.rollout import support_report
 from egs_warp.locomotion.stepper import StepReport, WarmStart
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.locomotion.world_rollout import world_steps
@@ -84,7 +85,8 @@ class SteeredBody:
         """Return the objectives of the next step."""
         if self.steering is None:
             return ()
-        return self.steering.objectives(self.state, self.report, dt)
+        report = None if self.report is None else support_report(self.member.body.stepper, self.report)
+        return self.steering.objectives(self.state, report, dt)
 
     def pushed(self, dt: float) -> BodyState:
         """Return the state after the pull and the pushes of the user."""

@@ -46,6 +46,7 @@ def test_motions_are_given_by_name_or_to_all_creatures() -> None:
         ("box: jump", "box is a prop, which has no muscles; leave --prop box out"),
         ("a: jump; a: walk 1", "a has another motion, too"),
         ("a: fly", "fly"),
+        ("", "name a motion"),
     ):
         with pytest.raises(UserError, match=message):
             motions_of(text, names, ["box"])

@@ -158,12 +158,11 @@ def test_bodies_that_push_from_the_side_are_no_support() -> None:
     _, _, reports = stepper.advance(start, run.memory, [], 1.0 / 60.0)
     contacts = reports[-1].contacts
     assert contacts.count >= 3
-    axes, weights, faces = contacts.axes.copy(), contacts.weights.copy(), contacts.faces.copy()
-    # Contact 0 becomes a push from the side, and contact 1 a point of another body below, whose weights sum to -1.
+    axes, faces = contacts.axes.copy(), contacts.faces.copy()
+    # Contact 0 becomes a push from the side, and contact 1 a contact with another body below.
     faces[:2] = -1
     axes[0] = axes[0, [1, 2, 0]]
-    weights[1] *= -1.0
-    pushed = replace(reports[-1], contacts=replace(contacts, axes=axes, weights=weights, faces=faces), min_gap=-0.1)
+    pushed = replace(reports[-1], contacts=replace(contacts, axes=axes, faces=faces), min_gap=-0.1)
     run.finish_step([pushed])
     run.objectives(1.0 / 60.0)
     report = seen[-1]

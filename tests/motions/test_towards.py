@@ -63,6 +63,9 @@ def test_a_walk_to_a_prop_is_refused_with_one_line() -> None:
     with pytest.raises(UserError, match=r"king is at the target, 1.50 ahead and 0.00 to the left"):
         script_among("walk to 1.5,0", {"king": king}, stance).check(stance)
     script_among("walk to 3,0", {"king": king}, stance).check(stance)
+    # Targets of later motions are checked where these start.
+    expected = script_among("walk to king, kick king, walk to 1.5,0", {"king": king}, stance).check(stance)
+    assert expected[0] > 0.0 and expected[1:] == [0.0, 0.0]
 
 
 @pytest.mark.parametrize(

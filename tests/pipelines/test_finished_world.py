@@ -9,14 +9,21 @@ import numpy as np
 import pytest
 
 from egs_warp import cli
+from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import UserError
+from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.io import read_capture
 from egs_warp.io.bundle import read_bundle
 from egs_warp.io.bundle_file import findings
-from egs_warp.pipelines.finished_world import SHAPE, FinishedWorld, is_world_folder, read_finished
+from egs_warp.io.ply import write_ply
+from egs_warp.pipelines.finished_world import SHAPE, FinishedWorld, is_world_folder, read_finished, scene_facts
 from egs_warp.pipelines.render_run import render_run
 from egs_warp.pipelines.shot import Shot
-from tests.support.finished_worlds import FRAMES, NAMES, write_world_run
+from egs_warp.pipelines.surroundings import Surroundings
+from egs_warp.pipelines.world import World
+from egs_warp.web.joint_header import joint_header
+from egs_warp.web.world_recording import WorldRecording
+from tests.support.finished_worlds import FRAMES, NAMES, box_cloud, write_world_run
 
 
 @pytest.fixture
@@ -74,6 +81,27 @@ def test_a_world_is_filmed_again_with_another_camera(folder: Path, tmp_path: Pat
     world = read_finished(folder)
     count = render_run(world, tmp_path / "film", Shot(size=(48, 36), fps=15.0), quiet=True)
     assert count == 3 and len(list((tmp_path / "film").glob("*.png"))) == 3
+
+
+def test_a_world_of_a_scene_is_shown_in_it(folder: Path) -> None:
+    """The scene is stored in the frame of its capture. It shows its own obstacles, so they are not drawn."""
+    frame = BodyFrame(np.eye(3)[[1, 2, 0]], np.array([1.0, 2.0, 3.0]), 0.5)
+    cloud = box_cloud((0.4, 0.4, 0.4))
+    surroundings = Surroundings(frame, to_body_frame(cloud, frame))
+    facts = scene_facts(World(surroundings=surroundings))
+    report = json.loads((folder / "report.json").read_text())
+    (folder / "report.json").write_text(json.dumps(report | {"scene": facts}))
+    assert FinishedWorld.read(folder).scene is None
+    write_ply(folder / "background.ply", cloud)
+    world = FinishedWorld.read(folder)
+    assert world.scene is not None and world.filmed.scene is world.scene and world.filmed.solids == ()
+    np.testing.assert_allclose(world.scene.means.numpy(), surroundings.cloud.means.numpy(), atol=1e-5)
+    recording = WorldRecording.read(folder)
+    assert b'"scene": 0' in recording.header() or b'"scene":0' in recording.header()
+    assert len(recording.header()) > len(joint_header({}, recording.page_bodies, world.first.trajectory.planes))
+    (folder / "report.json").write_text(json.dumps(report | {"scene": {"axes": 1}}))
+    with pytest.raises(UserError, match=r"report\.json: its scene is invalid; run egs-warp animate again"):
+        _ = FinishedWorld.read(folder).filmed
 
 
 def test_incomplete_folders_are_reported(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

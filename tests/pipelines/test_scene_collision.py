@@ -41,6 +41,14 @@ def test_written_obstacles_are_read_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, depth(solids, points), atol=2e-6)
 
 
+def test_solids_outside_the_measured_box_are_not_written(tmp_path: Path) -> None:
+    """A solid of a mesh of the user may be far from the objects, or touch the box only in a face."""
+    far, beside = box_between(np.full(3, 5.0), np.full(3, 6.0)), box_between(np.array([2.0, 0.0, 0.0]), np.full(3, 3.0))
+    near = box_between(np.zeros(3), np.ones(3))
+    write_collision_mesh(tmp_path / "mesh.glb", SceneObstacles(None, (far, beside, near), LOW, HIGH), FRAME)
+    assert [mesh.name for mesh in read_triangle_glb(tmp_path / "mesh.glb")] == ["ground", "solid-3"]
+
+
 def test_a_part_that_is_not_convex_becomes_boxes(tmp_path: Path) -> None:
     """A table of a plate and a leg, as one closed surface: the space beside the leg stays free."""
     parts = [solid_mesh(box_between(np.array(low), np.array(high))) for low, high in BARS]

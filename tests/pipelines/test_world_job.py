@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,10 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.end_state import State
 from egs_warp.pipelines.job import Job
-from egs_warp.pipelines.many import simulate_many
+from egs_warp.pipelines.many import WorldJobResult, simulate_many
 from egs_warp.pipelines.prop import make_prop
 from egs_warp.pipelines.world import World
-from egs_warp.pipelines.world_job import WorldJob
+from egs_warp.pipelines.world_job import BodyOutcome, WorldJob
 from tests.support.live_sessions import coarse_pawn
 
 
@@ -36,6 +37,15 @@ def test_jobs_of_a_world_have_the_bits_of_a_run_alone(tmp_path: Path) -> None:
             Trajectory.load(tmp_path / "job-0000" / f"{name}.npz").positions, outcome.trajectory.positions
         )
     assert second.state is None and "motion of 'knight': the world has no such body" in str(second.error)
+
+
+def test_a_world_of_props_that_stopped_is_not_done() -> None:
+    """A prop has no motion whose state could tell that a step was not solved."""
+    report: Any = SimpleNamespace(state=State.DONE)
+    trajectory: Any = None
+    for stopped, state in ((False, State.DONE), (True, State.STOPPED)):
+        bodies = {"box": BodyOutcome(report, np.zeros(1, int), trajectory, stopped)}
+        assert WorldJobResult(WorldJob(), 1, None, bodies).state is state
 
 
 def test_jobs_of_a_creature_are_no_jobs_of_a_world() -> None:
