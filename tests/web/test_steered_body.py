@@ -14,8 +14,8 @@ from egs_warp.web.world_session import SteeredBody
 
 
 def test_bodies_that_push_from_the_side_are_no_support() -> None:
-    """Of a contact with the ground, one with a body below and one with a body beside, the motion sees the first two,
-    and the gap to the ground instead of that to other bodies."""
+    """The motion sees contacts with the ground and with a body below, but not one with a body beside; its gap is that
+    to the ground, not to other bodies."""
     gravity, positions = np.array([0.0, 0.0, -9.81]), np.eye(4, 3)
     detector = SimpleNamespace(gaps=lambda positions: (np.array([0.02, 0.5]), np.zeros(2, int)))
     stepper = SimpleNamespace(body=SimpleNamespace(gravity=gravity), detector=detector)
