@@ -84,7 +84,7 @@ def print_rows(rows: list[Row]) -> None:
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Draw the ms per frame by stage, one bar for each example."""
+    """Plot the time per frame by stage, ms, with one bar for each example."""
     axes = figure.subplots()
     left = np.zeros(len(rows))
     for stage in stages_of(rows):

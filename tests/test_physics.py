@@ -259,8 +259,8 @@ def test_no_element_is_inverted_in_2000_frames_of_random_activations(mesh: TetMe
 @pytest.mark.cuda
 @at_length
 def test_cpu_and_cuda_give_the_same_motion(count: int) -> None:
-    """Eq. (4), (8), (9): 15 steps of a thrown body with elements and gaps on either device agree to 1e-9 H, for any
-    muscle forces.
+    """Eq. (4), (8), (9): after 15 steps of a thrown body, the positions with elements and gaps computed on the CPU and
+    on the GPU agree to 1e-9 H, for any muscle forces.
     """
 
     @drawn(count, shape=shapes(), throw=throws(), friction=frictions, share=st.sampled_from([0.0, 0.1, 0.5]))

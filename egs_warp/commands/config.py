@@ -42,7 +42,7 @@ def add_config_flag(parser: argparse._ActionsContainer) -> None:
 def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> list[str]:
     """Return ``arguments`` of ``parser``, preceded by the arguments in the file of ``--config``, if any.
 
-    Raises ``UserError`` for an unreadable file, unknown keys, and values that are not a text, number or boolean.
+    Raises ``UserError`` for an unreadable file, unknown keys, and values that are not a string, number or boolean.
     """
     config_parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     config_parser.add_argument("--config")
@@ -69,13 +69,13 @@ def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> li
         if isinstance(action, argparse._AppendAction):
             option, texts = action.option_strings[0], value if isinstance(value, list) else [value]
             if not all(isinstance(one, str | int | float) for one in texts):
-                raise UserError(f"{path}: {key} is {_short(value)}; give a text or a list of texts")
+                raise UserError(f"{path}: {key} is {_short(value)}; give a string or a list of strings")
             # Values on the command line replace the values of the file, to which argparse would append them.
             if not any(argument == option or argument.startswith(f"{option}=") for argument in rest):
                 flags += [f"{option}={_from_file(name, str(one), path.parent)}" for one in texts]
             continue
         if (value is True) != (action.nargs == 0) or not isinstance(value, bool | int | float | str):
-            expected = "true" if action.nargs == 0 else "a text or a number"
+            expected = "true" if action.nargs == 0 else "a string or a number"
             raise UserError(f"{path}: {key} is {_short(value)}; give {expected}")
         text = _from_file(name, str(value), path.parent)
         if not action.option_strings:

@@ -54,7 +54,7 @@ class IslandContacts:
         Args:
             previous: (m,) numbers of the contacts of the previous step.
             loaded: (m,) bool, True for those that carried load.
-            end_positions: (N, 3) m, at the predicted end of the step.
+            end_positions: (N, 3) m, at the end of a ballistic step (for a driven body, its prescribed end).
 
         Returns:
             (n,) numbers, those of contacts with the ground first.

@@ -110,7 +110,7 @@ class PairContactDetector:
         ``ContactSelector``.
 
         Args:
-            end_positions: (N, 3) m, at the predicted end of the step.
+            end_positions: (N, 3) m, at the end of a ballistic step (for a driven body, its prescribed end).
             previous: (m,) numbers of the contacts of the previous step.
             loaded: (m,) bool, True for those that carried load.
 

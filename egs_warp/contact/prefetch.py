@@ -28,8 +28,8 @@ int32 each, for 4 nodes, the face and the point.
 
 
 class ContactPrefetch:
-    """Gaps of all contact points of one body, at the start of a step and at its predicted end, and the contacts
-    selected from them.
+    """Gaps of all contact points of one body, at the start of a step and at the end of a ballistic step, and the
+    contacts selected from them.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class ContactPrefetch:
 
         Args:
             positions: (N,) m, nodes at the start of the step, on the device.
-            ends: (N,) m, nodes at the predicted end of the step.
+            ends: (N,) m, nodes at the end of a ballistic step.
             before: (m,) contact points of the previous step.
             loaded: (m,) bool, True for points that carried load.
         """
@@ -102,7 +102,7 @@ class ContactPrefetch:
 
         Args:
             positions: (N,) m, nodes at the start and at the end of the current step.
-            ends: (N,) m, nodes at the predicted end of the next step.
+            ends: (N,) m, nodes at the end of the next step, if it is ballistic.
             points: (K,) int32, contact points of the current step.
             counts: (1,) int32, number of valid ``points``.
             loads: (K,) newtons, normal forces at ``points``.
@@ -125,8 +125,8 @@ class ContactPrefetch:
             wp.to_torch(target).copy_(wp.to_torch(values))
 
     def _enqueue_selection(self, buffers: _TransferBuffers, gaps: wp.array, *start: wp.array) -> None:
-        """Select contacts by the ``gaps`` (1, P) at the end of the step, write their records from the positions, gaps
-        and faces at its ``start``, and start the download.
+        """Select contacts by the ``gaps`` (1, P) at the end of a ballistic step, write their records from the
+        positions, gaps and faces at its ``start``, and start the download.
         """
         chosen = buffers.selection
         self._selector.enqueue_selection(buffers.previous, gaps, [self._lowest, buffers.candidates], chosen.selected)

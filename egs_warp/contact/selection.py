@@ -113,7 +113,7 @@ class ContactSelector:
         Args:
             previous: points (B, L) of the previous step, their counts (B,), and (B, L) int, 1 for points that carried
                 load.
-            gaps: (B, P) m, at the predicted end of the step.
+            gaps: (B, P) m, at the end of a ballistic step.
             work: workspaces (B, C) int and (B, L + C) int.
             selected: points (B, K) with K at least L + C, and counts (B,), overwritten.
         """
@@ -165,7 +165,7 @@ class ContactSelector:
         Args:
             previous: (m,) points of the previous step.
             loaded: (m,) bool, True for points that carried load.
-            gaps: (P,) m, at the predicted end of the step.
+            gaps: (P,) m, at the end of a ballistic step.
 
         Returns:
             (n,) points in ascending order.
@@ -213,7 +213,7 @@ class ContactSelector:
         Args:
             previous: points (c, L) int32 of the previous step, their counts (c,) int32, and (c, L) int32, 1 for points
                 that carried load.
-            gaps: (c, P) m, at the predicted end of the step.
+            gaps: (c, P) m, at the end of a ballistic step.
 
         Returns:
             (c, L + C) int32 points, and (c,) int32 counts.

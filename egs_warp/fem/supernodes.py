@@ -14,7 +14,8 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
 _MAX_MERGED_WIDTH, _MAX_CHILD_WIDTH = 16, 6
-"""Maximum widths, in columns, up to which a merged block is narrow: of the merged block, or of the child alone."""
+"""Maximum widths in columns: a merged block is narrow if its own width is at most the first, or the width of the merged
+child at most the second."""
 _FILL_FRACTION = 0.3
 """Maximum fraction of zeros in a narrow merged block. For other merged blocks it is a third of this."""
 

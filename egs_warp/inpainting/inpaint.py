@@ -38,7 +38,7 @@ side."""
 _KNOWN = 0.6
 """Minimum opacity of the floor at which its colour is known."""
 _SOLID = 0.3
-"""Minimum opacity of a Gaussian that is floor."""
+"""Minimum opacity at which a Gaussian near the plane counts as floor."""
 _TEXELS_ACROSS = 120.0
 """Number of texels along the side of a hole of any size, so that the computing time does not depend on the size."""
 _WINDOW = 3.0

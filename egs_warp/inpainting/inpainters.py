@@ -231,8 +231,8 @@ def _last_line(error: Exception) -> str:
 def _answer(path: Path, values: np.ndarray, image: np.ndarray, hole: np.ndarray, padded: tuple[int, ...]) -> np.ndarray:
     if values.shape != (1, 3, *padded) or not np.isfinite(values).all():
         raise UserError(
-            f"{path}: the network returned shape {values.shape} or values that are not finite,"
-            f" expected {(1, 3, *padded)}; give LaMa's file"
+            f"{path}: the network returned shape {values.shape} or non-finite values; expected finite values of shape"
+            f" {(1, 3, *padded)}; give the TorchScript file of LaMa"
         )
     rows, columns = hole.shape
     filled = values[0].transpose(1, 2, 0)[:rows, :columns]

@@ -42,7 +42,7 @@ def _array(data: bytes) -> np.ndarray:
     member = BytesIO(data)
     version = np.lib.format.read_magic(member)
     if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"an array of format {version[0]}.{version[1]}")
+        raise ValueError(f"an array of format {version[0]}.{version[1]}, not 1.0 or 2.0")
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = header(member)
     if dtype.kind not in _NUMBERS or dtype.itemsize == 0:

@@ -241,8 +241,8 @@ def _text_poses(data: bytes, path: Path) -> list[_Pose]:
 
 
 def _is_point_line(words: list[str]) -> bool:
-    """Return True for a line with the points of an image: triples of two coordinates and an index. ``words`` are the
-    first nine words of the line, and the rest of the line."""
+    """Return True if a line contains the points of an image: triples of two coordinates and an index. ``words`` are
+    the first words of the line, at most nine; if there is a tenth string, it is the rest of the line."""
     try:
         for word in words[:9]:
             _camera_number(word)

@@ -19,7 +19,7 @@ class NamedFiles:
         self._paths = paths
 
     def begin(self) -> None:
-        """Back up existing files; call it when all files are about to be written."""
+        """Back up existing files. Call this immediately before the files are written."""
         for folder in dict.fromkeys(path.parent for path in self._paths):
             back_up(folder, [path.name for path in self._paths if path.parent == folder])
 

@@ -45,7 +45,7 @@ def frame_paths(folder: Path | str, numbers: Iterable[int], ending: str, *, alon
     """
     if (Path(folder) / MANIFEST).is_file():
         raise UserError(
-            f"{folder}: it is the folder of a run, and these files would be mixed with it; choose another folder"
+            f"{folder}: it is the folder of a run, and the frames would be mixed with its files; choose another folder"
         )
     paths = [Path(folder) / f"frame{number:04d}{ending}" for number in numbers]
     writable_folder(folder)

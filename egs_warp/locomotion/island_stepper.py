@@ -1,9 +1,9 @@
 """The step of an island, that is, of bodies that may touch each other: planned one by one and solved together.
 
-The unknowns of the QP of each creature are its activations and the forces of the contacts that it touches. The other
-contacts keep their predicted modes (``other_contacts``), so the other bodies yield to the creature. Plans are made in
-the order of the bodies (Gauss-Seidel): the plan of a creature uses the new activations of the creatures before it, and
-the previous activations of those after it.
+The QP of each creature is over its activations; the forces of the contacts that it touches follow from them
+(``contact_modes``). The other contacts keep their predicted modes (``other_contacts``), so the other bodies yield to
+the creature. Plans are made in the order of the bodies (Gauss-Seidel): the plan of a creature uses the new activations
+of the creatures before it, and the previous activations of those after it.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ class LocomotionSettings:
     """Options of ``LocomotionStepper``. Lengths are in body heights H, forces in body weights, speeds in sqrt(g H)."""
 
     activation_distance: float = 0.01
-    """Gap at the predicted end of a step below which a point can become a contact of the step."""
+    """Gap at the end of a ballistic step below which a point can become a contact of the step."""
     penetration_tolerance: float = 5e-3
     """Depth up to which a contact point is not pushed out."""
     push_out_cap: float = 0.05

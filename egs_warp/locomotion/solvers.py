@@ -147,7 +147,7 @@ class SplittingProgram:
         z = None if start is None else rows.whiten(start)
         result = self._splitting.warm_start(rows.unit_rows[index], below[index], above[index], z)
         if not result.status.usable or not np.isfinite(result.x).all():
-            # The active-set method decides whether the QP is feasible: OSQP returns x = 2e9 where it is uncertain.
+            # The active-set method decides whether the QP is feasible: where OSQP cannot decide, it returns x = 2e9.
             return self._solve_from_minimum(lower, upper, start)
         multipliers = np.zeros(len(lower))
         multipliers[index] = result.multipliers

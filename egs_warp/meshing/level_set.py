@@ -173,7 +173,7 @@ def thin_parts(solid: LatticeSolid) -> ThinParts:
     """Return the parts of ``solid`` (in metres) that are thinner than two cells and may therefore be missing in its
     level set."""
     inside = np.pad(solid.inside, 1)
-    # Reflect the solid at the plane, because the plane is no free surface of the body.
+    # Reflect the solid in the plane, because the plane is not a free surface of the body.
     inside[:, :, 0] = inside[:, :, 2]
     # Opening by a block of two cells: the minimum filter covers a point and its successor, the maximum filter a point
     # and its predecessor.

@@ -70,7 +70,7 @@ class GetUpPhase(Enum):
     LIE = "lie"
     ROLL = "roll"
     CATCH = "catch"
-    """The body comes to rest on its base, held low."""
+    """The body comes to rest on its base in a crouch."""
     STAND = "stand"
     GIVEN_UP = "given up"
 

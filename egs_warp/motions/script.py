@@ -291,7 +291,7 @@ def _own_style(text: Any, name: str, where: str) -> Style | None:
     if text is None:
         return None
     if not isinstance(text, str):
-        raise UserError(f'{where}: "style" is {json.dumps(text)}; give a text, such as "heavy" or "squash=1.2"')
+        raise UserError(f'{where}: "style" is {json.dumps(text)}; give a string, such as "heavy" or "squash=1.2"')
     if not _kind(name, where).jumps:
         raise UserError(f"{where}: {name} does not jump, so it has no style; jump, hop, twist and dance have one")
     if "overlap" in text:

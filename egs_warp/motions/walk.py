@@ -43,8 +43,9 @@ MIN_FOOT_LOAD = 0.01
 MAX_LAG = 0.5
 """Mean lag of the feet, in steps, beyond which a step is repeated."""
 MIN_REAR_MARGIN, MAX_LEAD = 0.21, 0.04
-"""Minimum distance of a walking body's centre of mass from the rear edge of its standing support, relative to the
-height of the centre of mass; and maximum lean forward that ensures it, in body heights (measured on the robot)."""
+"""Minimum distance of a walking body's centre of mass in front of the rear edge of its support polygon in standing,
+relative to the height of the centre of mass; and the maximum forward lean that maintains it, in body heights (measured
+on the robot)."""
 MIN_STEP_LENGTH = 0.002
 """Minimum step length in body heights."""
 _SHIFT_TIME, _GATHER_TIME, _REST_TIME = 1.5, 3.0, 1.0

@@ -71,7 +71,7 @@ class FinishedWorld:
             t, shape = run.trajectory, shapes[name]
             if len(shape.rest_positions) != len(t.rest_positions) or shape.point_tets.max(initial=0) >= len(t.tets):
                 advice = "run egs-warp animate again to write both"
-                raise UserError(f"{folder / name / SHAPE}: belongs to another cage than trajectory.npz; {advice}")
+                raise UserError(f"{folder / name / SHAPE}: does not belong to the cage of trajectory.npz; {advice}")
         return cls(folder, bodies, shapes, report)
 
     @property
@@ -140,7 +140,8 @@ class FinishedWorld:
 
     @cached_property
     def filmed(self) -> FilmedWorld:
-        """The bodies, ready to be drawn. A scene shows its own obstacles, so only the others are drawn."""
+        """The bodies, ready to be drawn. A captured scene already shows its own obstacles, so only additional obstacles
+        are drawn."""
         count = self.frame_count
         solids = self.solids if self.scene is None else self.solids[: int(self.report["scene"]["drawn_obstacles"])]
         bodies = {

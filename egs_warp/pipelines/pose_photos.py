@@ -188,7 +188,8 @@ def _work_folder(folder: Path, resume: bool | None) -> Iterator[Path]:
             yield Path(work)
         return
     kept.mkdir(exist_ok=True)
-    # Photos are copied again, because the copies may be incomplete; COLMAP skips features and matches in its database.
+    # Copy the photos again, because the copies may be incomplete. COLMAP does not recompute features and matches that
+    # its database already contains.
     for part in ("images", "models", "sparse"):
         shutil.rmtree(kept / part, ignore_errors=True)
     try:
@@ -325,7 +326,7 @@ class _DatabaseWatch:
 
 
 class _RowCounter:
-    """Context with a thread that counts the rows of a table at a fixed rate."""
+    """Context manager that runs a thread which counts the rows of a table at a fixed rate."""
 
     def __init__(self, database: Path, table: str, report: Callable[[int], None]) -> None:
         self._query = f"select count(*) from {table}"

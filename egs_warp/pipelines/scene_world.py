@@ -56,8 +56,8 @@ class SceneWorldOptions:
     solids: tuple[Solid, ...] | None = None
     """Obstacles beside and above the ground, in the frame and units of the capture; None measures them."""
     measures_obstacles: bool = True
-    """Measure the edge of the ground and the obstacles; otherwise the ground has no edge, and only ``solids`` are
-    obstacles."""
+    """True if the edge of the ground and the obstacles are measured. If False, the ground has no edge, and only
+    ``solids`` are obstacles."""
 
 
 @dataclass(frozen=True)

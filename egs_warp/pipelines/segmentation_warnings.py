@@ -79,7 +79,7 @@ def _touched_edges(object_cloud: GaussianCloud, camera: Camera) -> int:
     is_opaque = render_gaussians(object_cloud, camera).alpha.numpy() > 0.5
     edges = np.array([edge.sum() for edge in (is_opaque[0], is_opaque[-1], is_opaque[:, 0], is_opaque[:, -1])])
     least = _MIN_EDGE_SHARE * min(camera.width, camera.height)
-    # Parts that are too short individually are together considered one edge.
+    # If no edge has enough visible pixels by itself, all edges together may count as one.
     return int((edges > least).sum()) or int(edges.sum() > least)
 
 

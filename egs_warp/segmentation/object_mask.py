@@ -276,7 +276,8 @@ def _body(
     chosen &= ~removed
     if not chosen.any():
         raise UserError(_nothing_left("the clicks beside the object remove all of it", int(removed.sum())))
-    # Distant strays that some huge Gaussian connects would extend the following steps over the whole room.
+    # Remove distant strays that a huge Gaussian connects to the object: they would extend the following steps to the
+    # whole room.
     chosen &= _within(scene.means, chosen, size)
     # Floaters inside a hollow body would remain in the background as a ghost. The floor closes the body from below, and
     # so does the body's mirror image in the floor.

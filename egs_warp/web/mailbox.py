@@ -59,7 +59,7 @@ class Mailbox:
         wake()
 
     def unsubscribe(self) -> None:
-        """Unsubscribe the page, and release a pull of its user."""
+        """Unsubscribe the page and end any pull by its user."""
         with self._changed:
             self.watched, self._wake = False, lambda: None
             self._inbox.append(Release())

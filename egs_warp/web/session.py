@@ -263,7 +263,8 @@ class Session:
                 return
             self.creature, self.friction, self.sag, self._place = changed, friction, sag, place
             self._stillness.reset()
-            # Contacts and activations of the old body are a good initial guess for the new one.
+            # The contacts and activations are not reset: those of the old body are a good initial guess for the new
+            # one.
             self.steering.place = place
             self._reset_clock()
 

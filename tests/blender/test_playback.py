@@ -171,7 +171,7 @@ def test_a_bundle_shows_the_same_splats(run: FinishedRun, extension: Path, tmp_p
     export_bundle(run, bundle)
     script = ROOT / "tests" / "support" / "blender_session.py"
     blender(script, extension, bundle, tmp_path, str(FRAME), home=tmp_path)
-    # Half a step of the log scales, 1/256 for each, and of the rotations, 1/1024 rad.
+    # Tolerances for rounding errors of half a step: 1/256 for each log scale, 1/1024 rad for the rotations.
     check_splats(tmp_path / "splats.npz", run, shape=0.02, opacity=0.003, colour=0.004)
     results = json.loads((tmp_path / "results.json").read_text())
     assert "muscles" not in results and len(results["cage"]) == len(run.trajectory.rest_positions)

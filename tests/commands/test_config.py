@@ -114,7 +114,7 @@ def test_clicks_are_a_list_and_clicks_of_the_command_line_replace_those_of_the_f
     other = _given(["--config", str(tmp_path / "run.yaml"), "--object", "0,0,1"])
     assert other["object"] == ["0,0,1"]
     (tmp_path / "run.yaml").write_text("object: [[1, 2]]")
-    with pytest.raises(UserError, match=r"object is \[\[1, 2\]\]; give a text or a list of texts"):
+    with pytest.raises(UserError, match=r"object is \[\[1, 2\]\]; give a string or a list of strings"):
         _given(["--config", str(tmp_path / "run.yaml")])
 
 
@@ -123,11 +123,11 @@ def test_clicks_are_a_list_and_clicks_of_the_command_line_replace_those_of_the_f
     [
         ("speed: 3", "unknown key 'speed' (did you mean"),
         ("trust: true", "unknown key 'trust'"),
-        ("motion: [jump]", "motion is ['jump']; give a text or a number"),
-        ("motion: true", "motion is True; give a text or a number"),
+        ("motion: [jump]", "motion is ['jump']; give a string or a number"),
+        ("motion: true", "motion is True; give a string or a number"),
         ("no-shadow: 3", "no-shadow is 3; give true"),
         ("frames: many", "argument --frames: invalid int value: 'many'"),
-        ("seed: 2026-01-01", "seed is datetime.date(2026, 1, 1); give a text"),
+        ("seed: 2026-01-01", "seed is datetime.date(2026, 1, 1); give a string"),
         ("- jump", "no keys and values"),
         ("", "no keys and values"),
         ("a: [", "not YAML"),

@@ -212,7 +212,8 @@ def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
     cloud = GaussianCloud.from_numpy(
         means, np.tile([1, 0, 0, 0], (3, 1)), scales, np.zeros(3), np.zeros((3, 1, 3)), device=device
     )
-    # A chord over the arc of one arm (1.2 m) rotates by half that arc on each side: 1.2 / radius in all.
+    # The chord of one arm (1.2 m) rotates by half of the angle of its arc. For both arms, that is 1.2 / radius in
+    # total.
     radius = 1.2 / np.radians(40.0)
     deformer = Deformer(cloud, embed_gaussians(cloud, mesh, gamma=3.0))
     measure = deformer.measure_bend([mesh.nodes, bent(mesh.nodes, radius)])

@@ -100,7 +100,7 @@ def test_free_flight_is_a_parabola_with_constant_momentum() -> None:
         _, result = flight.advance(DT)
         assert result.converged
         time = step * DT
-        # Implicit Euler falls by g dt (t + dt) / 2 more than the parabola at the start of each step.
+        # In the time t, implicit Euler falls by g t (t + dt) / 2, which is g t dt / 2 more than the parabola.
         exact = centre + speed * time - 0.5 * GRAVITY * UP * time * (time + DT)
         assert np.abs(body.centre_of_mass(flight.state.positions) - exact).max() < 1e-9
         now = body.angular_momentum(flight.state.positions, flight.state.velocities)

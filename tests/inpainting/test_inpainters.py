@@ -89,7 +89,7 @@ def test_bad_networks(tmp_path: Path) -> None:
         def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
             return image[:, :, ::2] * mask[:, :, ::2]
 
-    with pytest.raises(UserError, match=r"returned shape \(1, 3, 20, 48\) .* expected \(1, 3, 40, 48\)"):
+    with pytest.raises(UserError, match=r"returned shape \(1, 3, 20, 48\) .* values of shape \(1, 3, 40, 48\)"):
         TorchScriptInpainter(traced(Half(), tmp_path / "half.pt")).fill(image, hole, ~hole)
 
     class One(torch.nn.Module):

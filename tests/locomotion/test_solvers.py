@@ -160,8 +160,8 @@ def test_an_iteration_limit_is_reported(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_program_whose_bounds_are_all_slack(capfd: pytest.CaptureFixture[str]) -> None:
-    """The result is the unconstrained minimum to rounding, without output of the solver. Programs in flight have such
-    bounds."""
+    """The result equals the unconstrained minimum up to rounding, and the solver prints nothing. The QP of a body in
+    flight has such bounds."""
     P, q, A = random_program(1)
     solution = quadratic_program(P, q, A).solve(np.full(30, -1e3), np.full(30, 1e3))
     assert solution.status is QpStatus.SOLVED and np.abs(P @ solution.x + q).max() < 1e-9

@@ -1,4 +1,4 @@
-"""Crawling of a long body by a wave of strides: strain limit, unloaded sections, and targets ahead and aside."""
+"""Crawling of a long body by a wave of strides: strain limit, unloaded sections, and targets ahead and to the side."""
 
 from __future__ import annotations
 

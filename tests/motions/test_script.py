@@ -183,7 +183,7 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
             f'[{{"motion": "jump", "distance": {401 * "1"}}}]',
             "distance inf: give a number of body heights from 0 to 10",
         ),
-        ('[{"motion": "jump", "style": 2}]', ', motion 1: "style" is 2; give a text, such as "heavy"'),
+        ('[{"motion": "jump", "style": 2}]', ', motion 1: "style" is 2; give a string, such as "heavy"'),
         (
             '[{"motion": "hop"}, {"motion": "jump", "style": "floppy"}]',
             ", motion 2: style: unknown word 'floppy'; give",

@@ -225,7 +225,7 @@ def test_frames_are_not_put_among_the_files_of_a_run(
     before = sorted(run_folder.iterdir())
     for command in (["export", str(run_folder), "--to", "ply"], ["render", str(run_folder), "--size", "32"]):
         assert main([*command, "--out", str(run_folder)]) == 2
-        message = f"{run_folder}: it is the folder of a run, and these files would be mixed with it"
+        message = f"{run_folder}: it is the folder of a run, and the frames would be mixed with its files"
         assert message in capsys.readouterr().err
     assert sorted(run_folder.iterdir()) == before
 

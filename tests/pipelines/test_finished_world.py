@@ -116,7 +116,7 @@ def test_incomplete_folders_are_reported(folder: Path, tmp_path: Path, capsys: p
         read_finished(folder, background=tmp_path / "a.ply")
     shape = (folder / "block" / SHAPE).read_bytes()
     (folder / "block" / SHAPE).write_bytes((folder / "box-1" / SHAPE).read_bytes())
-    with pytest.raises(UserError, match=r"block.contact_shape\.npz: belongs to another cage"):
+    with pytest.raises(UserError, match=r"block.contact_shape\.npz: does not belong to the cage of trajectory\.npz"):
         FinishedWorld.read(folder)
     (folder / "block" / SHAPE).write_bytes(shape[:-200])
     with pytest.raises(UserError, match=r"contact_shape\.npz: cannot be read"):

@@ -133,9 +133,9 @@ def test_inconsistent_roughness_is_no_ground(
     [("koala.ply", (0.1, -0.7, 0.15)), ("fox.ply", (0.0, 0.0, 2.0)), ("narcissus.sog", (0.0, -0.8, 0.0))],
 )
 def test_real_grounds_that_are_flat_stay_planes(data_dir: Path, file: str, click: tuple) -> None:
-    """The captures stand on gravel, on a plinth, and on glossy paper that mirrors the koala. The splats of the paper
-    are off the plane by 2.4 % of the koala's height, but views of them differ by 1.1 %.
-    """
+    """The objects stand on gravel, on a plinth, and on glossy paper that mirrors the koala. The splats of the paper
+    deviate from the plane by 2.4 % of the koala's height, but the heights seen from different views differ by 1.1 %, so
+    this counts as noise."""
     cloud, spec = read_capture(data_dir / "scenes" / file).cloud, ObjectSpec(point=np.array(click))
     located = with_measured_ground(cloud, locate_plane(cloud, spec), spec)
     assert located.ground is None
@@ -152,7 +152,7 @@ def test_ground_is_raised_to_the_object() -> None:
     thing = ball(0.04)
     beside = sheet(np.array([[0.0, 1.5, -0.1]]), np.array([[0.0, 0.0, 1.0]]), 0.035, (0.8, 0.3, 0.2))
     size = np.sqrt(3.0)
-    # An object beside the field that hangs lower does not stand on it.
+    # A part of the object outside the field is ignored, although it hangs lower.
     raised = measured.touched_by(concatenate(thing, beside), size)
     means = thing.means.numpy().astype(np.float64)
     assert field.heights(means).min() > 0.035 and abs(raised.heights(means).min()) < 0.002

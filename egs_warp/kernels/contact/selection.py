@@ -143,8 +143,8 @@ def select_points_kernel(
     """Select the points of a step by the rules of ``ContactSelector``, in ascending order.
 
     ``previous`` (B, L) are the points of the previous step, ``loaded`` (B, L) is 1 for points that carried load,
-    ``gaps`` (B, P) are the gaps at the predicted end, and ``lowest`` (B, C) is the lowest active point of each cell;
-    ``candidates`` (B, L + C) is a workspace.
+    ``gaps`` (B, P) are the gaps at the end of a ballistic step, and ``lowest`` (B, C) is the lowest active point of
+    each cell; ``candidates`` (B, L + C) is a workspace.
     """
     world, lane = wp.tid()
     slots = previous.shape[1]
