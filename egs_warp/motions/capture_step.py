@@ -23,6 +23,9 @@ from egs_warp.motions.stance import BalanceController
 from egs_warp.motions.walk import Walk
 from egs_warp.motions.walk_posture import LEGGED_TIMING, LeggedPosture, select_posture
 
+FALLEN_TILT = 60.0
+"""Tilt in degrees beyond which a body has fallen. A body with feet of half width w and its centre of mass at height h
+tips over beyond a tilt of atan(w / h), which is below 60 degrees if the feet are narrower than 3.5 h."""
 STEP_MARGIN = 0.02
 """Distance of the capture point outside the support, in body heights, beyond which a body steps."""
 STEP_SPEED = 1.6
@@ -43,7 +46,7 @@ def capture_motion(
     """Return the motion that brings an unbalanced body to rest over new footholds.
 
     It is None if the capture point is in the support or at most ``STEP_MARGIN`` outside, if nothing supports the body,
-    or if the body cannot step.
+    if the body has fallen and must get up, or if it cannot step.
 
     Args:
         stance: stance in which the body stood.
@@ -61,6 +64,7 @@ def capture_motion(
         or not np.isfinite(capture).all()
         or measurement.support.margin(capture) > -STEP_MARGIN * body.height
         or stance.base() in (SupportKind.ROUND_BASE, SupportKind.LYING)
+        or _up_cosine(stance, measurement) < np.cos(np.radians(FALLEN_TILT))
     ):
         return None
     # The body turns about the point of its support that is nearest to the capture point.
@@ -72,6 +76,12 @@ def capture_motion(
         return _step(stance, moved, fall, centre, report) if on_legs else _hop(stance, moved, fall, centre)
     except UserError:
         return None
+
+
+def _up_cosine(stance: Stance, measurement: Measurement) -> float:
+    """Return the cosine of the tilt of the body from its standing pose."""
+    up = stance.ground.axes[2]
+    return float(up @ measurement.rotation @ up)
 
 
 def _hop(stance: Stance, moved: Stance, fall: FallingPendulum, centre: np.ndarray) -> Jump:

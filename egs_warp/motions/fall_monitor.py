@@ -10,6 +10,7 @@ from egs_warp.fem.body import BodyState
 from egs_warp.geometry.frames import nearest_rotation
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
+from egs_warp.motions.capture_step import FALLEN_TILT
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.follow import Follow
 from egs_warp.motions.get_up import GetUp
@@ -19,9 +20,6 @@ from egs_warp.motions.sequence import BodyMotion, MotionSequence, MotionTask, St
 from egs_warp.motions.stance import sole_shares
 from egs_warp.motions.support import SupportPolygon
 
-FALLEN_TILT = 60.0
-"""Tilt in degrees beyond which a body has fallen. A body with feet of half width w and its centre of mass at height h
-tips over beyond a tilt of atan(w / h), which is below 60 degrees if the feet are narrower than 3.5 h."""
 MIN_LYING_LOAD = 0.5
 """Minimum load, as a share of the weight, on another part of the surface of a body whose base is unloaded for the body
 to be lying. Smaller loads also occur in brief contacts with a riser or a wall."""

@@ -65,9 +65,12 @@ class Turn:
 
     def _chance_of_another(self, missing: float) -> float:
         """Return the probability of another jump if a turn of ``missing`` radians is predicted to remain. The
-        prediction is uncertain while the body is in the air."""
-        if self.jumps[-1].phase is JumpPhase.FLIGHT:
-            return min(missing / (2.0 * HEADING_TOLERANCE), 1.0)
+        prediction is uncertain while the body is in the air, and less so while its feet slide after the landing."""
+        jump, share = self.jumps[-1], missing / HEADING_TOLERANCE
+        if jump.phase is JumpPhase.FLIGHT:
+            return min(0.5 * share, 1.0)
+        if jump.phase is JumpPhase.LAND and 0.5 < share < 1.5:
+            return CORRECTION_RATE
         return float(missing > HEADING_TOLERANCE)
 
     @property
