@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, Self, TypeVar
@@ -19,20 +20,20 @@ from egs_warp.motions.stance import BalanceController
 
 
 @dataclass(frozen=True)
-class MotionWorlds(BatchedRecord):
+class MotionWorlds(BatchedRecord, ABC):
     """State machines of c worlds with the same body. Their state changes in place."""
 
     current: Balance
     """Balance in the present reference frame."""
 
     @property
+    @abstractmethod
     def is_resting(self) -> np.ndarray:
         """(c,) bool, True for bodies at rest."""
-        raise NotImplementedError
 
+    @abstractmethod
     def step(self, state: ReducedState, dt: float) -> ReducedObjectives:
         """Return the objectives of the time step of ``dt`` seconds from ``state`` and advance the state machines."""
-        raise NotImplementedError
 
 
 WorldsT = TypeVar("WorldsT", bound=MotionWorlds)

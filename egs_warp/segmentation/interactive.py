@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.height_field import HeightField
@@ -21,19 +20,15 @@ from egs_warp.segmentation.above_plane import MIN_OPACITY, SceneAbovePlane
 from egs_warp.segmentation.clicks import Click
 from egs_warp.segmentation.floor_remnants import floor_remnants
 from egs_warp.segmentation.graph_cut import SplatGraph
+from egs_warp.segmentation.supervoxels import link_gaps, supervoxels
 
 _NEIGHBOURS = 6
 """Number of nearest neighbours to which a Gaussian is linked."""
-_SIGMAS, _MAX_GAP = 3.0, 2.0
-"""Half-length of a Gaussian in standard deviations, and the longest gap that a link bridges, as a multiple of the
-median distance between neighbours. Without the limit, a floater in empty space would be linked to the object alone, and
-every cut would be costlier than including it."""
+_MAX_GAP = 2.0
+"""Longest gap that a link bridges, as a multiple of the median distance between neighbours. Without the limit, a
+floater in empty space would be linked to the object alone, and every cut would be costlier than including it."""
 _CLUSTER = 12
 """Maximum number of Gaussians in a cluster."""
-_COLOUR_SPLITS = 2
-"""Number of final halvings that may also separate colours."""
-_COLOUR_RANGE = 0.3
-"""Range of a colour channel, 0 to 1, that is equivalent to the longest side of a cluster when the cluster is halved."""
 _MIN_PART = 8
 """Minimum number of clusters in the part that a click selects."""
 _MAX_EXTENT = 0.9
@@ -80,8 +75,9 @@ class ClickGraph:
         colours = cloud.sh.numpy()[opaque, 0].astype(np.float64) * SH_BAND_0 + 0.5
         nodes = np.flatnonzero(opaque)
         links = SplatGraph.of(cloud, nodes, neighbours=_NEIGHBOURS)
-        links = links.where(_gaps(cloud, nodes, links) < _MAX_GAP)
-        own = _clusters(points, np.clip(colours, 0.0, 1.0))
+        links = links.where(link_gaps(cloud, nodes, links) < _MAX_GAP)
+        levels = max(0, int(np.ceil(np.log2(max(len(points), 1) / _CLUSTER))))
+        own = supervoxels(points, np.clip(colours, 0.0, 1.0), levels)
         # A cluster is a box, which may hold a part of the object and a floater far from it.
         parts = links.parts(np.ones(len(own), bool)).astype(np.int64)
         own = np.unique(own * len(own) + parts, return_inverse=True)[1].astype(np.int32)
@@ -283,48 +279,3 @@ def _without(links: SplatGraph, seeds: np.ndarray, removed: np.ndarray) -> np.nd
     included[seeds], excluded[removed] = True, True
     mean = 2.0 * links.strength.sum() / max(links.count, 1)
     return links.cut(score, included, excluded, smoothness=1.0 / max(mean, 1e-12))
-
-
-def _gaps(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph) -> np.ndarray:
-    """Return (m,), the length of the empty part of each link between the Gaussians ``nodes`` (k,), divided by the
-    median length of all links; negative if the two Gaussians overlap."""
-    points = cloud.means.numpy()[nodes].astype(np.float64)
-    arms = points[links.second] - points[links.first]
-    lengths = np.linalg.norm(arms, axis=1)
-    along = arms / np.maximum(lengths, 1e-30)[:, None]
-    quaternions = cloud.rotations.numpy()[nodes]
-    scales = np.exp(cloud.log_scales.numpy()[nodes].astype(np.float64))
-    extents = (
-        np.linalg.norm(
-            scales[ends] * Rotation.from_quat(quaternions[ends], scalar_first=True).apply(along, inverse=True), axis=1
-        )
-        for ends in (links.first, links.second)
-    )
-    # Links within one place have no length.
-    typical = float(np.median(lengths[links.length > 0.0])) if (links.length > 0.0).any() else 1.0
-    return (lengths - _SIGMAS * sum(extents)) / max(typical, 1e-30)
-
-
-def _clusters(points: np.ndarray, colours: np.ndarray) -> np.ndarray:
-    """Return (n,) int32, clusters of at most ``_CLUSTER`` Gaussians each, made by repeated halving along the longest
-    side; the last halvings also separate colours."""
-    count = len(points)
-    levels = max(0, int(np.ceil(np.log2(max(count, 1) / _CLUSTER))))
-    values = np.concatenate([points, colours], axis=1)
-    order, owner = np.arange(count), np.zeros(count, np.int64)
-    for level in range(levels):
-        starts = np.flatnonzero(np.diff(owner, prepend=-1))
-        ordered = values[order]
-        extents = np.maximum.reduceat(ordered, starts) - np.minimum.reduceat(ordered, starts)
-        longest = extents[:, :3].max(axis=1, keepdims=True)
-        extents[:, :3] /= np.maximum(longest, 1e-30)
-        extents[:, 3:] *= 1.0 / _COLOUR_RANGE if level >= levels - _COLOUR_SPLITS else 0.0
-        sizes = np.diff(starts, append=count)
-        axis = np.repeat(np.argmax(extents, axis=1), sizes)
-        along = ordered[np.arange(count), axis]
-        order = order[np.lexsort((along, owner))]
-        place = np.arange(count) - np.repeat(starts, sizes)
-        owner = 2 * owner + (place >= np.repeat((sizes + 1) // 2, sizes))
-    result = np.empty(count, np.int32)
-    result[order] = np.unique(owner, return_inverse=True)[1]
-    return result

@@ -17,18 +17,13 @@ from egs_warp.geometry.camera import Camera, downscale
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.segmentation.above_plane import MIN_OPACITY
 from egs_warp.segmentation.graph_cut import SplatGraph
+from egs_warp.segmentation.supervoxels import link_gaps, supervoxels
 from egs_warp.segmentation.votes import MaskedView, blending_votes
 
 _NEIGHBOURS = 6
 """Number of nearest neighbours to which a Gaussian is linked."""
-_SIGMAS = 3.0
-"""Half-length of a Gaussian in standard deviations."""
 _MAX_CLUSTERS = 1 << 14
 """Maximum number of supervoxels before supervoxels of several connected components are divided."""
-_COLOUR_SPLITS = 2
-"""Number of final halvings that may also separate colours."""
-_COLOUR_RANGE = 0.3
-"""Range of a colour channel, 0 to 1, that is equivalent to the longest side of a cluster when the cluster is halved."""
 _VIEWS, _SIDE = 16, 160
 """Maximum number of photos that orient the normals, and the longer side of their renders, pixels."""
 
@@ -101,7 +96,8 @@ class SurfaceGraph:
         degree = np.bincount(ends, minlength=len(nodes))
         spacing = np.bincount(ends, np.tile(lengths, 2), len(nodes)) / np.maximum(degree, 1)
         links = SplatGraph(links.count, links.first, links.second, lengths, np.ones(len(lengths)), links.colour_unit)
-        own = _clusters(points, colours)
+        levels = int(np.ceil(np.log2(min(max(len(points), 1), _MAX_CLUSTERS))))
+        own = supervoxels(points, colours, levels)
         # A cluster is a box, which may hold a part of the object and a floater far from it.
         parts = links.where(features.gap == 0.0).parts(np.ones(len(own), bool)).astype(np.int64)
         own = np.unique(own * len(own) + parts, return_inverse=True)[1].astype(np.int32)
@@ -138,7 +134,7 @@ def _features(
     both = known[first] & known[second]
     turn = np.where(both, 1.0 - np.einsum("ij,ij->i", normals[first], normals[second]), 0.0)
     bend = np.where(both, bend, 0.0)
-    gap = np.maximum(_gaps(cloud, nodes, links), 0.0)
+    gap = np.maximum(link_gaps(cloud, nodes, links), 0.0)
     return LinkFeatures(contrast, np.maximum(-bend, 0.0), np.maximum(bend, 0.0), turn, gap)
 
 
@@ -169,48 +165,3 @@ def _outward_normals(
     mixing = coo_array((np.tile(agreement, 2), ends), shape=(len(nodes),) * 2).tocsr()
     weighted = weighted + mixing @ weighted
     return weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-12)
-
-
-def _gaps(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph) -> np.ndarray:
-    """Return (m,), the length of the empty part of each link between the Gaussians ``nodes`` (k,), divided by the
-    median length of all links; negative if the two Gaussians overlap."""
-    points = cloud.means.numpy()[nodes].astype(np.float64)
-    arms = points[links.second] - points[links.first]
-    lengths = np.linalg.norm(arms, axis=1)
-    along = arms / np.maximum(lengths, 1e-30)[:, None]
-    quaternions = cloud.rotations.numpy()[nodes]
-    scales = np.exp(cloud.log_scales.numpy()[nodes].astype(np.float64))
-    extents = (
-        np.linalg.norm(
-            scales[ends] * Rotation.from_quat(quaternions[ends], scalar_first=True).apply(along, inverse=True), axis=1
-        )
-        for ends in (links.first, links.second)
-    )
-    # Links within one place have no length.
-    typical = float(np.median(lengths[links.length > 0.0])) if (links.length > 0.0).any() else 1.0
-    return (lengths - _SIGMAS * sum(extents)) / max(typical, 1e-30)
-
-
-def _clusters(points: np.ndarray, colours: np.ndarray) -> np.ndarray:
-    """Return (n,) int32, at most ``_MAX_CLUSTERS`` clusters, made by repeated halving along the longest side; the last
-    halvings also separate colours."""
-    count = len(points)
-    levels = int(np.ceil(np.log2(min(max(count, 1), _MAX_CLUSTERS))))
-    values = np.concatenate([points, colours], axis=1)
-    order, owner = np.arange(count), np.zeros(count, np.int64)
-    for level in range(levels):
-        starts = np.flatnonzero(np.diff(owner, prepend=-1))
-        ordered = values[order]
-        extents = np.maximum.reduceat(ordered, starts) - np.minimum.reduceat(ordered, starts)
-        longest = extents[:, :3].max(axis=1, keepdims=True)
-        extents[:, :3] /= np.maximum(longest, 1e-30)
-        extents[:, 3:] *= 1.0 / _COLOUR_RANGE if level >= levels - _COLOUR_SPLITS else 0.0
-        sizes = np.diff(starts, append=count)
-        axis = np.repeat(np.argmax(extents, axis=1), sizes)
-        along = ordered[np.arange(count), axis]
-        order = order[np.lexsort((along, owner))]
-        place = np.arange(count) - np.repeat(starts, sizes)
-        owner = 2 * owner + (place >= np.repeat((sizes + 1) // 2, sizes))
-    result = np.empty(count, np.int32)
-    result[order] = np.unique(owner, return_inverse=True)[1]
-    return result
