@@ -24,6 +24,7 @@ ACROSS = {
     "web/test_live_page.py",
     "web/test_react.py",
     "web/test_steered.py",
+    "web/test_three_scene.py",
 }
 """Tests of a whole package, or of several modules."""
 
