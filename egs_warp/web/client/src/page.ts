@@ -359,7 +359,8 @@ export class Page {
   /** True if the next image must wait for the sorting of the splats: at the start, and on a slow machine. Without an
    * order, only the shadow would be visible; with an outdated order, the ground would hide the body. */
   private get isWaitingForSort(): boolean {
-    if (!this.isDrawn) return true;
+    // The first image of a live session may precede its order: its motion must not wait.
+    if (!this.isDrawn && this.live === undefined) return true;
     const isSlow = this.player.playing && this.frameTime > MAX_FRAME_TIME;
     return isSlow && this.viewers.some((viewer) => viewer.sorting);
   }
