@@ -49,6 +49,13 @@ def test_images_are_small_and_made_by_the_script() -> None:
     assert sum(path.stat().st_size for path in (DOCS / "assets").iterdir()) <= 4e6
 
 
+def test_the_site_has_the_accent_colours_of_the_pages() -> None:
+    controls = (ROOT / "egs_warp" / "web" / "client" / "src" / "controls.css").read_text()
+    dark, light = re.findall(r"--accent: var\(--egs-accent, (#\w+)\)", controls)
+    site = (DOCS / "assets" / "site.css").read_text()
+    assert re.findall(r"--md-accent-fg-color: (#\w+)", site) == [light, dark]
+
+
 @pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: str(page.relative_to(DOCS)))
 def test_every_picture_has_its_command_on_its_page(page: Path) -> None:
     text = page.read_text()

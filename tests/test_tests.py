@@ -19,9 +19,12 @@ ACROSS = {
     "motions/test_runs.py",
     "pipelines/test_invariance.py",
     "pipelines/test_python_api.py",
+    "web/test_accessibility.py",
     "web/test_headset.py",
     "web/test_live_page.py",
+    "web/test_react.py",
     "web/test_steered.py",
+    "web/test_three_scene.py",
 }
 """Tests of a whole package, or of several modules."""
 

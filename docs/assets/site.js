@@ -41,6 +41,9 @@ function textsOf(element) {
   return texts;
 }
 
+// The theme gives the search no name for screen readers.
+document$.subscribe(({ body }) => body.querySelector(".md-search")?.setAttribute("aria-label", "Search"));
+
 // A page of a run takes the place of its film, unless it is asked for in a tab of its own.
 document$.subscribe(({ body }) => {
   for (const link of body.querySelectorAll("a.in-3d")) {

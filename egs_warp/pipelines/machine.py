@@ -25,6 +25,7 @@ OPTIONAL = {
     "torch": ("training, and fine-tuning of Gaussians that straddle the ground", "egs-warp[torch]"),
     "pycolmap": ("egs-warp pose", "egs-warp[pose]"),
     "usd-core": ("exports to USD", "egs-warp[usd]"),
+    "anywidget": ("egs.show in notebooks", "egs-warp[notebook]"),
     "gymnasium": ("environments of many worlds", "egs-warp[gymnasium]"),
     "ray": ("runs on the hosts of a cluster", "egs-warp[ray]"),
 }

@@ -96,7 +96,7 @@ def test_a_style_is_selected_by_name_or_by_number(chromium: Any, session: Sessio
         page.click("[title='Style, friction, stiffness, pushes']")
         page.click("#style-heavy")
         wait_until(page, f"egs.live.state?.style.squash === 1.4 && {pressed} === 'heavy'")
-        assert page.text_content("label:has([aria-label=Squash]) output") == "1.40\u00d7"
+        assert page.text_content("label:has([aria-label=Squash]) .value") == "1.40\u00d7"
         page.locator("[aria-label=Anticipation]").focus()
         page.keyboard.press("Home")
         wait_until(page, f"egs.live.state?.style.anticipation === 0.5 && {pressed} === ''")

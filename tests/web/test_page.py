@@ -31,7 +31,6 @@ from egs_warp.render.shadow import ContactShadow
 from egs_warp.web.page import export_page
 from egs_warp.web.recording import Recording
 from tests.support.chromium import BROWSER, NEEDED, opened, wait_until
-from tests.support.page_design import check_controls, check_focus, contrast
 from tests.support.pages import served
 
 pytestmark = NEEDED
@@ -220,7 +219,8 @@ def test_a_run_plays_by_itself_once_its_splats_are_sorted(chromium: Any, file: s
     still = chromium.new_page(reduced_motion="reduce")
     still.goto(file)
     wait_until(still, "window.egs !== undefined")
-    assert not still.evaluate("egs.player.playing")
+    wait_until(still, "!egs.viewers[0].dirty")
+    assert still.evaluate("!egs.player.playing && egs.viewers[0].splatRenderer.spark.activeSplats > 0")
     assert complaints == []
     still.close()
 
@@ -511,22 +511,5 @@ def test_a_background_scene_is_on_the_ground_and_receives_the_shadow(chromium: A
     assert abs(np.median(picture[180:300, 10:40]) - 0.5) < 0.03
     page.evaluate("egs.setLayer('scene', false)")
     np.testing.assert_allclose(_picture(page)[240, 20], _BACKGROUND, atol=0.01)
-    assert complaints == []
-    page.close()
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_a_phone_has_labelled_readable_controls_within_its_width(chromium: Any, file: str, scheme: str):
-    page, complaints = opened(chromium, file, 360, 740, color_scheme=scheme)
-    page.evaluate("egs.setLayer('muscles', true)")
-    page.keyboard.press("c")
-    for menu in ("Layers", "Camera"):
-        page.click(f"[title={menu}]")
-        assert page.get_attribute(f"[title={menu}]", "aria-expanded") == "true"
-        assert check_controls(page, 360) > 20
-    check_focus(page, 8)
-    for text in (".clock", ".menu:not([hidden]) .item", ".legend", ".curves small"):
-        assert contrast(page, text, ".dock") >= 4.5, text
-    assert (page.evaluate("getComputedStyle(document.body).color") == "rgb(217, 222, 232)") == (scheme == "dark")
     assert complaints == []
     page.close()

@@ -19,7 +19,7 @@ export class Charts {
     for (const { title, unit } of source.header.facts.curves) {
       const hint = `${title}; click to go to that time`;
       const canvas = element("canvas", { class: "curve", role: "img", "aria-label": hint, title: hint });
-      const value = element("output", { class: "value" });
+      const value = element("span", { class: "value" });
       const row = element(
         "div",
         { class: "row" },

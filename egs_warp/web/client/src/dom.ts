@@ -74,6 +74,29 @@ export function button(name: Icon, title: string, onClick: () => void): HTMLButt
   return created;
 }
 
+/** Button that shows or hides `panel` and hides `others`; it tells a screen reader whether the panel is shown. */
+export function opener(
+  name: Icon,
+  title: string,
+  panel: HTMLElement,
+  others: readonly HTMLElement[] = [],
+): HTMLButtonElement {
+  const created = button(name, title, () => {
+    panel.hidden = !panel.hidden;
+    for (const other of others) other.hidden = true;
+  });
+  const update = (): void => created.setAttribute("aria-expanded", String(!panel.hidden));
+  update();
+  // Keys show and hide panels, too.
+  new MutationObserver(update).observe(panel, { attributeFilter: ["hidden"] });
+  return created;
+}
+
+/** Canvas with a 3D view. A screen reader passes the keys on to it. */
+export function viewCanvas(label: string, className = ""): HTMLCanvasElement {
+  return element("canvas", { class: className, tabindex: "0", role: "application", "aria-label": label });
+}
+
 /** Download a blob as a file. */
 export function save(blob: Blob, name: string): void {
   const link = element("a", { href: URL.createObjectURL(blob), download: name });

@@ -1,7 +1,7 @@
 // Live session: playback clock, control bar, settings, and messages of the session.
 
 import { StylePanel } from "./style_panel";
-import { button, element, icon, save } from "./dom";
+import { button, element, icon, opener, save } from "./dom";
 import { LiveClock } from "./clock";
 import { InputControls, Pointer, type Action } from "./input";
 import { Gizmos } from "./gizmos";
@@ -54,7 +54,7 @@ export class Live {
   private readonly pointer: Pointer;
   private readonly gizmos: Gizmos;
   private readonly pushTool: PushTool;
-  private readonly speedLabel = element("output", { class: "pace", title: "Simulation speed relative to real time" });
+  private readonly speedLabel = element("span", { class: "pace", title: "Simulation speed relative to real time" });
   private readonly nextLabel = element("output", { class: "next", title: "Motion that comes next" });
   private readonly pauseButton: HTMLButtonElement;
   private readonly recordButton: HTMLButtonElement;
@@ -164,10 +164,6 @@ export class Live {
       created.id = action;
       return created;
     };
-    const toggleSheet = (sheet: HTMLElement, other: HTMLElement) => () => {
-      sheet.hidden = !sheet.hidden;
-      other.hidden = true;
-    };
     const pad = element(
       "div",
       { class: "pad" },
@@ -182,10 +178,10 @@ export class Live {
       "div",
       {},
       button("stand", "Reset to the start (backspace)", () => this.source.send({ type: "stand" })),
-      button("sliders", "Style, friction, stiffness, pushes", toggleSheet(this.settingsSheet, this.helpSheet)),
+      opener("sliders", "Style, friction, stiffness, pushes", this.settingsSheet, [this.helpSheet]),
       this.recordButton,
       button("script", "Save the performed motions as a script", () => this.source.send({ type: "script" })),
-      button("help", "Keys (?)", toggleSheet(this.helpSheet, this.settingsSheet)),
+      opener("help", "Keys (?)", this.helpSheet, [this.settingsSheet]),
     );
     const step = button("step", "One step (.)", () => this.step());
     const labels = element("div", { class: "labels" }, this.speedLabel, this.nextLabel);

@@ -33,10 +33,6 @@ function showConnection(reason: string | undefined): void {
   document.body.dataset.lost = reason ?? "";
 }
 
-function webgl2(): boolean {
-  return document.createElement("canvas").getContext("webgl2") !== null;
-}
-
 function showMessage(message: string): void {
   document.getElementById("page")?.replaceChildren(element("p", { class: "message", role: "alert" }, message));
 }
@@ -50,13 +46,6 @@ declare global {
 
 async function start(): Promise<void> {
   const root = document.getElementById("page") as HTMLElement;
-  if (!webgl2()) {
-    showMessage(
-      "This browser has no WebGL2, which is needed to draw the splats. " +
-        "Enable hardware acceleration in its settings or use another browser.",
-    );
-    return;
-  }
   showMessage(LOADING);
   try {
     window.egs = new Page(root, await findRuns());

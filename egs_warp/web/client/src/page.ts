@@ -2,7 +2,7 @@
 
 import { BodyPanel } from "./body_panel";
 import { Charts } from "./charts";
-import { button, element, save, type Icon } from "./dom";
+import { button, element, opener, save, viewCanvas } from "./dom";
 import { createKeySheet } from "./key_sheet";
 import { Legend } from "./legend";
 import { VideoRecorder } from "./video_recorder";
@@ -52,6 +52,16 @@ const HELP: [string[], string][] = [
   [["?"], "these keys"],
 ];
 
+/** True if the control that has the keyboard focus uses the key of an event. In a recorded run, arrow keys move the time
+ * line by frames. */
+function isKeyOfControl({ target, key }: KeyboardEvent, isRecorded: boolean): boolean {
+  if (!(target instanceof HTMLElement)) return false;
+  if (target instanceof HTMLSelectElement) return true;
+  if (target.matches("input[type=range]")) return !isRecorded && /^(Arrow|Home|End|Page)/.test(key);
+  // A control on which the user has clicked leaves the space bar to playback.
+  return (key === " " || key === "Enter") && target.matches(":is(button, input, summary, a):focus-visible");
+}
+
 export class Page {
   readonly viewers: Viewer[] = [];
   readonly player: Player;
@@ -89,7 +99,7 @@ export class Page {
     document.title = `${first.header.facts.title} \u2013 egs_warp`;
     root.replaceChildren(views);
     for (const source of sources) {
-      const canvas = element("canvas", { class: "view", tabindex: "0", "aria-label": source.header.facts.title });
+      const canvas = viewCanvas(source.header.facts.title, "view");
       views.append(element("figure", {}, canvas, element("figcaption", {}, source.header.facts.title)));
       const viewer = new Viewer(canvas, source);
       this.viewers.push(viewer);
@@ -112,8 +122,8 @@ export class Page {
     const recorded = preparation === undefined ? [this.bar.element] : [preparation.element];
     const controls = this.pick?.elements() ?? this.live?.elements() ?? [...recorded, this.keySheet];
     const notes = element("div", { class: "notes" }, this.legend.element, this.charts.panel);
-    root.append(this.toolbar(), notes, ...controls);
     this.charts.panel.hidden = true;
+    root.append(this.toolbar(), notes, ...controls);
     const { bodies } = first.header.facts;
     if (bodies !== undefined && sources.length === 1) {
       const select = (index: number): void => (this.live === undefined ? this.select(index) : this.live.select(index));
@@ -225,17 +235,9 @@ export class Page {
       const hint = "The camera moves along the ground with the body";
       views.append(element("label", { title: hint }, follow, element("span", {}, "Follow the creature")));
     }
-    const opener = (icon: Icon, title: string, menu: HTMLElement, other: HTMLElement): HTMLButtonElement => {
-      const created = button(icon, title, () => {
-        menu.hidden = !menu.hidden;
-        other.hidden = true;
-        for (const one of openers) one.setAttribute("aria-expanded", String(one === created && !menu.hidden));
-      });
-      created.setAttribute("aria-expanded", "false");
-      return created;
-    };
-    const camera = opener("view", "Camera", views, layers);
-    const openers = [camera, opener("layers", "Layers", layers, views)];
+    const camera = opener("view", "Camera", views, [layers]);
+    const curves = opener("curves", "Curves (c)", this.charts.panel);
+    curves.addEventListener("click", () => this.charts.draw(this.framePosition));
     const what = this.live === undefined ? "Record a video of the whole run" : "Record a video of this view";
     const record = button("record", what, () => this.record(record));
     if (this.pick !== undefined) {
@@ -245,21 +247,17 @@ export class Page {
     return element(
       "nav",
       { class: "tools", "aria-label": "View" },
-      openers[1]!,
+      opener("layers", "Layers", layers, [views]),
       camera,
-      button("curves", "Curves (c)", () => this.toggleCurves()),
+      curves,
       button("camera", this.live === undefined ? "Screenshot (s)" : "Screenshot", () => void this.screenshot()),
       record,
       // Two runs side by side have no common position in a room, and a prepared creature gets a page of its own.
       ...(this.viewers.length > 1 || this.first.source.header.facts.preparing ? [] : this.first.headset.buttons),
-      ...(this.live === undefined ? [button("help", "Keys (?)", () => this.toggleKeys())] : []),
+      ...(this.live === undefined ? [opener("help", "Keys (?)", this.keySheet)] : []),
       layers,
       views,
     );
-  }
-
-  private toggleKeys(): void {
-    this.keySheet.hidden = !this.keySheet.hidden;
   }
 
   private toggleCurves(): void {
@@ -312,13 +310,11 @@ export class Page {
 
   private keyDown(event: KeyboardEvent): void {
     const hasModifier = event.ctrlKey || event.metaKey || event.altKey;
-    const { target } = event;
     if (this.pick !== undefined) {
-      if (!(target instanceof HTMLSelectElement) && this.pick.keyDown(event)) event.preventDefault();
+      if (!(event.target instanceof HTMLSelectElement) && this.pick.keyDown(event)) event.preventDefault();
       return;
     }
-    const isTyping = target instanceof HTMLSelectElement || (this.live && target instanceof HTMLInputElement);
-    if (isTyping || hasModifier) return;
+    if (hasModifier || isKeyOfControl(event, this.live === undefined)) return;
     if (this.live?.keyDown(event)) {
       event.preventDefault();
       return;
@@ -332,7 +328,7 @@ export class Page {
     else if (event.key === "ArrowLeft") this.player.step(-1);
     else if (event.key === "s") void this.screenshot();
     else if (event.key === "l") this.bar.toggleLoop();
-    else if (event.key === "?") this.toggleKeys();
+    else if (event.key === "?") this.keySheet.hidden = !this.keySheet.hidden;
     else if (event.key === "Escape") this.keySheet.hidden = true;
     else return;
     event.preventDefault();
@@ -363,8 +359,10 @@ export class Page {
   /** True if the next image must wait for the sorting of the splats: at the start, and on a slow machine. Without an
    * order, only the shadow would be visible; with an outdated order, the ground would hide the body. */
   private get isWaitingForSort(): boolean {
-    if (!this.player.playing) return false;
-    return !this.isDrawn || (this.frameTime > MAX_FRAME_TIME && this.viewers.some((viewer) => viewer.sorting));
+    // The first image of a live session may precede its order: its motion must not wait.
+    if (!this.isDrawn && this.live === undefined) return true;
+    const isSlow = this.player.playing && this.frameTime > MAX_FRAME_TIME;
+    return isSlow && this.viewers.some((viewer) => viewer.sorting);
   }
 
   private animate(now: number): void {

@@ -1,6 +1,6 @@
 // Page of egs-warp pick: marks, objects, ground, front, and buttons for the commands that use the picked object.
 
-import { button, element, type Icon } from "./dom";
+import { button, element, opener, type Icon } from "./dom";
 import { createKeySheet } from "./key_sheet";
 import { PickGizmos, type Handle } from "./pick_gizmos";
 import type { BodyNews, JobNews, PickState } from "./pick_news";
@@ -81,7 +81,7 @@ export class Pick {
     const history = element("div", {}, undo, redo);
     const panelButton = button("sliders", "Objects and motions", () => this.panel.toggle());
     panelButton.classList.add("narrow");
-    const more = element("div", {}, save, panelButton, button("help", "Keys (?)", () => this.toggleHelp()));
+    const more = element("div", {}, save, panelButton, opener("help", "Keys (?)", this.helpSheet));
     const dock = element("footer", { class: "dock pick" }, marks, history, this.workLabel, more);
     return [this.panel.element, dock, this.helpSheet, this.toasts.element];
   }
@@ -100,7 +100,7 @@ export class Pick {
     else if (key === "b") this.toggleBrush();
     else if (key === "s") this.send("save");
     else if (key === "n") this.send("add");
-    else if (key === "?") this.toggleHelp();
+    else if (key === "?") this.helpSheet.hidden = !this.helpSheet.hidden;
     else if (key === "escape") this.helpSheet.hidden = true;
     else if (key === "o" && this.state !== undefined && this.state.objects.length > 1) {
       this.source.send({ type: "select", index: (this.state.active + 1) % this.state.objects.length });
@@ -110,10 +110,6 @@ export class Pick {
 
   private send(type: "undo" | "redo" | "save" | "add"): void {
     this.source.send({ type });
-  }
-
-  private toggleHelp(): void {
-    this.helpSheet.hidden = !this.helpSheet.hidden;
   }
 
   private setAdding(isAdding: boolean): void {

@@ -20,7 +20,7 @@ export class PlaybackBar {
   private readonly slider = element("input", {
     ...{ type: "range", min: "0", step: "any", class: "line", "aria-label": "Time", title: "Time" },
   });
-  private readonly clock = element("output", { class: "clock", title: "Time and duration" });
+  private readonly clock = element("span", { class: "clock", role: "timer", title: "Time and duration" });
   private readonly speed = element("select", { class: "speed", "aria-label": "Speed", title: "Speed" });
   private readonly loopButton: HTMLButtonElement;
 

@@ -23,6 +23,10 @@ export interface StageOptions {
   light?: MainLight | undefined;
 }
 
+const NO_WEBGL2 =
+  "This browser has no WebGL2, which is needed to draw the splats. " +
+  "Enable hardware acceleration in its settings or use another browser.";
+
 function pause(milliseconds: number): Promise<void> {
   return new Promise((resolve) => setTimeout(resolve, milliseconds));
 }
@@ -44,6 +48,8 @@ export abstract class Stage {
   /** Fraction of the canvas resolution along each side; reduced on slow machines. */
   private resolution = 1;
   private dirty = true;
+  /** True once an image was drawn. */
+  protected hasImage = false;
   private isDisposed = false;
 
   constructor(
@@ -52,8 +58,10 @@ export abstract class Stage {
   ) {
     this.height = height;
     // Spark advises against multisampling, which does not improve splats.
-    const context = { canvas, antialias: false, alpha: true };
-    this.renderer = new THREE.WebGLRenderer({ ...context, powerPreference: "high-performance" });
+    const attributes: WebGLContextAttributes = { antialias: false, alpha: true, powerPreference: "high-performance" };
+    const context = canvas.getContext("webgl2", attributes);
+    if (context === null) throw new Error(NO_WEBGL2);
+    this.renderer = new THREE.WebGLRenderer({ canvas, context });
     this.renderer.setClearColor(BACKGROUND, 1);
     this.camera.up.set(0, 0, 1);
     this.ground = new Ground(surface, nodeCount, height, light, extent);
@@ -133,14 +141,14 @@ export abstract class Stage {
   /** Draw after the splats are sorted for the current view. */
   async drawSorted(): Promise<void> {
     const { spark } = this.splatRenderer;
-    for (let round = 0; round < 2 && !this.isDisposed; round++) {
-      this.camera.updateMatrixWorld();
-      // Colours depend on the direction from the camera.
-      this.bodies.update();
-      this.render();
-      await spark.update({ scene: this.scene, camera: this.camera });
-      while (spark.sorting) await pause(5);
-    }
+    // Spark ignores an update that changes the number of splats during a sort.
+    while (spark.sorting) await pause(5);
+    if (this.isDisposed) return;
+    this.camera.updateMatrixWorld();
+    // Colours depend on the direction from the camera.
+    this.bodies.update();
+    await spark.update({ scene: this.scene, camera: this.camera });
+    while (spark.sorting) await pause(5);
     if (this.isDisposed) return;
     this.render();
     this.dirty = false;
@@ -150,6 +158,7 @@ export abstract class Stage {
     const isAbove = this.headset.isPresenting || this.camera.position.z > 0;
     this.splatRenderer.floorDepth.value = this.hasOpaqueFloor && isAbove ? FLOOR_DEPTH * this.height : 0;
     this.renderer.render(this.scene, this.camera);
+    this.hasImage = true;
   }
 
   /** Release the WebGL context, after the sort in progress: Spark cannot read from a lost context. */

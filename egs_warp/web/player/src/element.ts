@@ -193,9 +193,6 @@ export class EgsPlayer extends HTMLElement {
   }
 
   private async show(bundle: Bundle): Promise<void> {
-    if (document.createElement("canvas").getContext("webgl2") === null) {
-      throw new Error("This browser has no WebGL2, which is needed to draw the splats.");
-    }
     this.bundle = bundle;
     const stage = new BundleStage(bundle);
     this.stage = stage;
@@ -211,7 +208,7 @@ export class EgsPlayer extends HTMLElement {
     this.image.hidden = true;
     const isStill = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
     if (this.hasAttribute("autoplay") && !isStill) this.play();
-    this.update();
+    this.updateControls();
     this.dispatchEvent(new Event("canplay"));
     // In a headset, this is the animation loop of its session.
     stage.renderer.setAnimationLoop((now) => this.tick(now));
@@ -249,8 +246,12 @@ export class EgsPlayer extends HTMLElement {
 
   /** Show the current frame and the state of playback. */
   private update(): void {
+    this.stage?.show(this.player.framePosition);
+    this.updateControls();
+  }
+
+  private updateControls(): void {
     const { player } = this;
-    this.stage?.show(player.framePosition);
     this.bar.element.hidden = !this.hasAttribute("controls") || this.stage === undefined;
     // Without a bar, a player without `autoplay` shows one large button.
     this.startButton.hidden = player.playing || this.hasAttribute("autoplay") || !this.bar.element.hidden;

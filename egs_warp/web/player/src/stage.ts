@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 import type { Bodies } from "../../client/src/bodies";
-import { element } from "../../client/src/dom";
+import { viewCanvas } from "../../client/src/dom";
 import { BACKGROUND } from "../../client/src/ground";
 import { Stage } from "../../client/src/stage";
 import type { Bundle, Camera } from "./bundle";
@@ -36,7 +36,7 @@ export class BundleStage extends Stage {
   constructor(bundle: Bundle) {
     const { facts, bodies } = bundle;
     const nodeCount = bodies.reduce((sum, { cage }) => sum + (cage?.rest.length ?? 0) / 3, 0);
-    super(element("canvas", { tabindex: "0", "aria-label": facts.title ?? "creature" }), {
+    super(viewCanvas(facts.title ?? "creature"), {
       antialiased: bodies[0]?.antialiased ?? false,
       height: (facts.height ?? 1) * facts.metres_per_unit,
       surface: surfaceOf(bundle),
@@ -105,7 +105,7 @@ export class BundleStage extends Stage {
   override resize(): void {
     super.resize();
     // Resizing clears the canvas, which the browser may present before the next animation frame.
-    if (!this.headset.isPresenting) this.render();
+    if (this.hasImage && !this.headset.isPresenting) this.render();
   }
 
   private placement(): THREE.Matrix4 {
