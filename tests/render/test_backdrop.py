@@ -159,7 +159,7 @@ def test_a_shadow_is_as_sharp_in_a_long_motion_as_in_a_short_one(step: float) ->
     body = placed(ball, ball.means.numpy() + place)
     options = {"device": body.device, "blur_radius": shadow_blur_radius(body), "height": 1.0}
     short = ContactShadow(camera(), FLOOR, centre=place, reach=2.0, **options)
-    # A whole number of texels away from the body, so that the texels of both maps coincide; the shadow fades farther away.
+    # A whole number of texels away from the body, so that the texels of both maps coincide.
     far = place - 300.0 * (4.0 / 192.0) * np.array([1.0, 0.0, 0.0])
     moving, fixed = (
         ContactShadow(camera(), FLOOR, centre=far, reach=30.0, body_reach=reach, **options) for reach in (2.0, None)
