@@ -156,7 +156,8 @@ class _Asset:
         left_out = sum(1 for mesh, found in enumerate(splats) if found and mesh not in parts)
         notes = dict.fromkeys(note for found in parts.values() for part in found for note in part.notes)
         if left_out:
-            notes[f"left out, because the scene does not show them: {left_out} mesh{'es' * (left_out > 1)} of splats"] = None
+            unseen = f"{left_out} mesh{'es' * (left_out > 1)} of splats"
+            notes[f"left out, because the scene shows none of it: {unseen}"] = None
         transforms = np.concatenate([one.transforms for one in placed])
         up, origin = _Y_UP, None
         is_shared = np.allclose(transforms, transforms[0], rtol=1e-14, atol=1e-14)

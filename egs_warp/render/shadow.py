@@ -198,8 +198,9 @@ class ContactShadow:
         uneven = np.zeros(count) if depth is None else depth.ravel()
         self._surface_depth = wp.array(uneven, dtype=wp.float32, device=device)
         body = {"device": device, "blur_radius": blur_radius, "height": height}
-        self._moves = body_reach is not None and body_reach < reach
-        maps = [ShadowMap(plane, centre=centre, reach=body_reach if self._moves else reach, **body)]
+        map_reach = reach if body_reach is None else min(body_reach, reach)
+        self._moves = map_reach < reach
+        maps = [ShadowMap(plane, centre=centre, reach=map_reach, **body)]
         fades = [reach]
         opacities = [1.0]
         if light is not None and light.shade > 0.0:

@@ -19,7 +19,6 @@ from tests.support.live_pages import in_browser
 from tests.support.packets import read_packets
 from tests.support.pages import served
 
-
 _KEEP_STILL_WIDTH = """{
     const { remove } = Element.prototype;
     Element.prototype.remove = function () {
