@@ -60,9 +60,20 @@ class _Parser(argparse.ArgumentParser):
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
             names = [str(choice) for choice in action.choices]
-            raise argparse.ArgumentError(
-                action, f"{value!r} is unknown{did_you_mean(value, names)}; give one of {', '.join(names)}"
-            )
+            near = did_you_mean(value, names) if action.dest != "command" else _meant_command(value, names)
+            raise argparse.ArgumentError(action, f"{value!r} is unknown{near}; give one of {', '.join(names)}")
+
+
+def _meant_command(word: str, names: Sequence[str]) -> str:
+    """Return a suggestion in brackets for ``word``, which is not one of the commands ``names``."""
+    # Importing the motions takes a fraction of a second.
+    from egs_warp.motions.repertoire import MOTIONS
+
+    if word in MOTIONS:
+        return f" (did you mean animate CAPTURE --motion {word} --out FOLDER?)"
+    if os.path.isfile(word):  # False for a name that is too long, unlike Path.is_file
+        return f" (did you mean animate {word} --out FOLDER?)"
+    return did_you_mean(word, names)
 
 
 def _check_flags(words: Sequence[str], command: argparse.ArgumentParser) -> None:

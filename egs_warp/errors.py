@@ -8,14 +8,21 @@ from collections.abc import Callable, Iterable, Sequence
 _MAX_MESSAGE_LENGTH = 2000
 """Maximum number of characters of a message; the middle of a longer one is cut out."""
 
+_MIN_BEGINNING = 3
+"""Minimum number of letters of the beginning of a name."""
+
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
-    """Return `` (did you mean 'walk'?)`` with the member of ``names`` that is most similar to the unknown ``name``, or
-    an empty text if none is similar."""
+    """Return `` (did you mean 'walk'?)`` with the member of ``names`` that begins with the unknown ``name`` or, if none
+    does, is most similar to it; an empty text if none is similar."""
     # Ignore case; of members that differ only in case, suggest the first. No suggestion for a name that is a member:
     # it is in the wrong position, not misspelt.
     by_lower = {str(known).lower(): str(known) for known in reversed(list(names))}
-    near = difflib.get_close_matches(str(name).lower(), by_lower, n=1) if str(name) not in by_lower.values() else []
+    written = str(name).lower()
+    longer = [known for known in by_lower if len(written) >= _MIN_BEGINNING and known.startswith(written)]
+    near = longer[-1:] or difflib.get_close_matches(written, by_lower, n=1)
+    if str(name) in by_lower.values():
+        near = []
     return f" (did you mean {by_lower[near[0]]!r}?)" if near else ""
 
 

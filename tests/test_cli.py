@@ -251,6 +251,8 @@ def test_choices_of_flags_are_those_of_the_library() -> None:
 @pytest.mark.parametrize(
     ("line", "suggestion"),
     [
+        ("twist a.ply", "'twist' is unknown (did you mean animate CAPTURE --motion twist --out FOLDER?); give one of "),
+        (f"{__file__}", f"is unknown (did you mean animate {__file__} --out FOLDER?); give one of doctor, demo"),
         ("animte a.ply", "'animte' is unknown (did you mean 'animate'?); give one of doctor, "),
         ("animate a.ply --out b --resume", "--resume (did you mean the command egs-warp resume?)"),
         ("animate a.ply --otu b", "unrecognized arguments: --otu (did you mean '--out'?)"),
@@ -359,7 +361,7 @@ def test_the_help_of_animate_lists_the_registry(capsys: pytest.CaptureFixture[st
         main(["animate", "--help"])
     text = " ".join(capsys.readouterr().out.split())
     for name, kind in MOTIONS.items():
-        assert re.search(rf"(one of|,) {name}( FILE)?(,| --object)", text), name
+        assert re.search(rf"(one of|,) '?{name}'?( FILE)?(,| --object)", text), name
         for value in kind.parameters:
             if value.name in ("distance", "height", "heading_degrees"):
                 flag = value.name.replace("_", "-")

@@ -10,7 +10,7 @@ import pytest
 
 from egs_warp.commands.exit_handling import one_line_errors
 from egs_warp.commands.flags import flag_of
-from egs_warp.errors import ArgumentError, UserError
+from egs_warp.errors import ArgumentError, UserError, did_you_mean
 
 PACKAGE = Path(__file__).parents[1] / "egs_warp"
 FLAG = re.compile(r"(?<![\w-])--[a-z]")
@@ -29,6 +29,12 @@ def test_an_argument_is_called_by_its_name_or_by_its_flag() -> None:
 def test_a_line_stays_one_line() -> None:
     error = ArgumentError("motion", "a\nb" + 3000 * "c", value="\x1b[1m")
     assert str(error).startswith("motion \\x1b[1m: a\\nbccc") and len(str(error)) < 2010
+
+
+def test_the_beginning_of_a_name_suggests_the_first_such_name() -> None:
+    names = ["stand", "land and pose", "land on", "walk"]
+    assert did_you_mean("Land", names) == " (did you mean 'land and pose'?)"
+    assert did_you_mean("la", names) == "" and did_you_mean("wlak", names) == " (did you mean 'walk'?)"
 
 
 def test_a_program_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -206,13 +206,12 @@ def add_parser(commands: Commands) -> None:
 
 def complete_help(parser: argparse.ArgumentParser) -> None:
     """Write the names and default values of the registry into the help texts."""
-    from egs_warp.motions.repertoire import MOTIONS
+    from egs_warp.motions.repertoire import MOTIONS, motion_names
     from egs_warp.motions.style import MAX_FACTOR, MAX_OVERLAP, MIN_FACTOR, PRESETS, Style
 
-    names = ", ".join(f"{name} FILE" if kind.file else name for name, kind in MOTIONS.items())
     factors = " ".join(f"{name}=1.2" for name in vars(Style()) if name != "overlap")
     added = {
-        "motion": f"one of {names}",
+        "motion": f"one of {', '.join(motion_names(files=' FILE'))}",
         "style": f"{', '.join(PRESETS)}, or factors from {MIN_FACTOR:g} to {MAX_FACTOR:g}, as {factors};"
         f" overlap=0.1 (0 to {MAX_OVERLAP:g}) makes ears, arms and tails soft",
     }

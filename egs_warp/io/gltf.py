@@ -149,14 +149,15 @@ class _Asset:
         meshes = self.tree.get("meshes", [])
         splats = [[p for p in mesh["primitives"] if _is_splats(p)] for mesh in meshes]
         if not any(splats):
-            kind = f", only {len(meshes)} meshes" if meshes else ""
+            kind = f", only {len(meshes)} mesh{'es' * (len(meshes) > 1)}" if meshes else ""
             raise UserError(f"{self.source}: glTF without splats ({EXTENSION}){kind}; export it as splats, or as .ply")
         placed = placements(self.tree, self.source, self._accessor, lambda mesh: bool(splats[mesh]))
         parts = {mesh: [self._primitive(p) for p in splats[mesh]] for mesh in {one.mesh for one in placed}}
         left_out = sum(1 for mesh, found in enumerate(splats) if found and mesh not in parts)
         notes = dict.fromkeys(note for found in parts.values() for part in found for note in part.notes)
         if left_out:
-            notes[f"{left_out} meshes of splats that the scene does not show were left out"] = None
+            unseen = f"{left_out} mesh{'es' * (left_out > 1)} of splats"
+            notes[f"left out, because the scene shows none of it: {unseen}"] = None
         transforms = np.concatenate([one.transforms for one in placed])
         up, origin = _Y_UP, None
         is_shared = np.allclose(transforms, transforms[0], rtol=1e-14, atol=1e-14)

@@ -74,6 +74,10 @@ class RunFolder:
             self._write_manifest(dict.fromkeys(self._names), finished=False)
         return self.path / name
 
+    def has(self, name: str) -> bool:
+        """Return True if the run has written the file ``name``."""
+        return name in self._names and (self.path / name).is_file()
+
     def folder(self, name: str) -> Path:
         """Return the path of the folder ``name`` of the run, like ``file``. All files in it are results."""
         self._result_folders.add(name)

@@ -118,6 +118,7 @@ class Jump(JoinedMotion[JumpWorlds]):
             start_com=com[None],
             start_base=(com[:2] + start.base_offset)[None],
             skips_settling=array(skips_settling),
+            settle_time=array(np.nan),
             landing_height=array(float(com[2])),
             # Copies, because the frame changes at take-off.
             current=start.balance.with_world_axis().gather(np.array([0])),
@@ -220,7 +221,9 @@ class Jump(JoinedMotion[JumpWorlds]):
         began; NaN after touch-down."""
         plan, ground = self.plan, self.ground
         axes = ground.axes @ ground.rotation_about_up(self.target_heading) if self.is_airborne else ground.axes
-        return plan.planned_displacement(max(elapsed - SETTLE_TIME * self._time_unit, 0.0), self.gravity) @ axes
+        waited = float(self._worlds.settle_time[self._row])
+        begin = SETTLE_TIME * self._time_unit if np.isnan(waited) else waited
+        return plan.planned_displacement(max(elapsed - begin, 0.0), self.gravity) @ axes
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> None:
         """Return None: a jump has no quantities of its own beyond those measured for all motions."""

@@ -115,6 +115,9 @@ class JumpWorlds(MotionWorlds):
     """(c, 2) m, middle of the feet there."""
     skips_settling: np.ndarray
     """(c,) bool, True if the crouch starts at the first time step."""
+    settle_time: np.ndarray
+    """(c,) s, time from the first time step to the crouch; NaN before the first step. The body settles at the start of
+    the run, so that a later jump of a sequence begins with its crouch."""
     landing_height: np.ndarray
     """(c,) m, height at which the centre of mass of the landed body comes to rest."""
     is_airborne: np.ndarray
@@ -170,6 +173,9 @@ class JumpWorlds(MotionWorlds):
     def _advance_phase(self, measurement: Measurement, time: np.ndarray, dt: float) -> None:
         # Contacts while the body still rises are not a landing.
         in_contact = measurement.in_contact & (measurement.velocity[:, 2] < 0.0)
+        is_first = np.isnan(self.settle_time)
+        settling = np.where(self.skips_settling, 0.0, np.maximum(SETTLE_TIME * self.time_unit - time, 0.0))
+        self.settle_time[is_first] = settling[is_first]
         elapsed, plan, phase = time - self.entered + 1e-9, self.plan, self.phase
         is_over = np.select(
             [phase == each for each in range(_REST)],

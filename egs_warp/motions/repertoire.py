@@ -392,6 +392,12 @@ _OWN = MotionKind((), _own_tasks, lambda request: int(np.ceil(60.0 * request.sec
 """Motion of the user's own class, which may jump."""
 
 
+def motion_names(files: str = "") -> list[str]:
+    """Return the names of all motions for lists in messages, in quotes if they contain "and"; the names of those that
+    need a file are followed by ``files``."""
+    return [f"'{name}'" if " and " in name else name + files * bool(kind.file) for name, kind in MOTIONS.items()]
+
+
 def kind_of_request(request: MotionRequest) -> MotionKind:
     """Return the kind of the motion of ``request``."""
     return MOTIONS[request.name] if request.begin is None else _OWN

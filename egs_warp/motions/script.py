@@ -22,7 +22,14 @@ from egs_warp.io.text import parse_json, read_text, whole_number
 from egs_warp.motions.beats import parse_beats
 from egs_warp.motions.command import Drive, DrivePlan
 from egs_warp.motions.keyframes import Key, checked_keys
-from egs_warp.motions.repertoire import MOTIONS, MotionKind, frames_of_request, kind_of_request, tasks_of_request
+from egs_warp.motions.repertoire import (
+    MOTIONS,
+    MotionKind,
+    frames_of_request,
+    kind_of_request,
+    motion_names,
+    tasks_of_request,
+)
 from egs_warp.motions.request import LayerRequest, MotionRequest
 from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance, TargetError
 from egs_warp.motions.style import Style, read_style
@@ -33,8 +40,11 @@ MotionFactory: TypeAlias = "Callable[[Stance], BodyMotion]"
 MAX_MOTIONS = 100
 _MAX_SECONDS = 3600.0
 """Largest time limit of a motion of the user's own class, s."""
-_NAMES = ", ".join(MOTIONS)
+_NAMES = ", ".join(motion_names())
 _GESTURES = tuple(name for name, kind in MOTIONS.items() if kind.gesture is not None)
+_CONJUNCTIONS = ("and", "then", "while", "with", "&")
+"""Words between two motions that mean a separator."""
+_SEPARATORS = "separate motions by commas, and add a gesture on top of a motion by +, as in 'jump, walk 1 + nod'"
 _AT = Value("at", 0.0, 0.0, 60.0, "seconds")
 """Parameter of a gesture on top of a motion: its start after the start of the motion, s."""
 _BEATS_FILE = "file of beats"
@@ -240,6 +250,8 @@ def _from_words(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRe
             file = Path(word)
         else:
             free = [key for key in order if key not in values]
+            if not _is_number(word) and word.lower() in (*MOTIONS, *_CONJUNCTIONS):
+                raise UserError(f"{where} ({piece!r}): {word!r} is not a number; {_SEPARATORS}")
             if not free:
                 raise UserError(f"{where} ({piece!r}): {word!r} is one value too many; {kind.usage(name)}")
             values[free[0]] = word

@@ -36,5 +36,6 @@ class Value:
         if not fits or (self.is_integer and number != int(number)):
             kind = "a whole number" if self.is_integer else "a number"
             span = f"above {self.minimum:g} up to" if self.is_exclusive else f"from {self.minimum:g} to"
-            raise UserError(f"{where}: {self.name} {value}: give {kind} of {self.unit} {span} {self.maximum:g}")
+            given = f"{self.name} {value}" if value != "" else f"{self.name} without a value"
+            raise UserError(f"{where}: {given}: give {kind} of {self.unit} {span} {self.maximum:g}")
         return number

@@ -13,6 +13,7 @@ from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
 from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
+from egs_warp.io import write_ply
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
@@ -31,7 +32,7 @@ from egs_warp.pipelines.capture_warnings import capture_warnings
 from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.film import Film, draw_film, picture_seconds
 from egs_warp.pipelines.film_time import FilmTimeNote
-from egs_warp.pipelines.finished_run import PARTS
+from egs_warp.pipelines.finished_run import BACKGROUND, PARTS
 from egs_warp.pipelines.ground_coverage import ground_coverage_warning
 from egs_warp.pipelines.plots import draw_plots
 from egs_warp.pipelines.progress import preparation_bar, simulation_bar
@@ -214,6 +215,9 @@ def animate(
     pushes = read_pushes(options.push) if options.push is not None else ()
     ffmpeg_program()
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
+        if background is not None and not run.has(BACKGROUND):
+            # Another film, a page or an export of the finished run shows it again.
+            write_ply(run.file(BACKGROUND), background)
         with preparation_bar(quiet=quiet) as begin_stage:
             creature_options = replace(options.creature, overlap=max(options.creature.overlap, jump_style.overlap))
             creature = make_creature(cloud, up=up, plane=plane, options=creature_options, progress=begin_stage)

@@ -40,6 +40,9 @@ SHEET_FRAMES = 12
 """Number of frames on the contact sheet."""
 SPLIT_KEY_FRAMES = 24
 """Number of frames whose deformation decides which Gaussians are split."""
+_SHADOW_MARGIN = 0.7
+"""Width of the soft edge of a shadow straight below a body, body heights: four standard deviations of the blur of its
+highest layer (``egs_warp/render/shadow.py``), plus a texel."""
 _BELOW_GROUND = 0.005
 """Depth below flat ground, body heights, from which the Gaussians of a capture without a scene are hidden."""
 
@@ -253,8 +256,11 @@ def drawn_frames(
     """
     # The shape of uneven ground is not drawn, so its plane must not hide a creature in a hollow.
     is_flat = trajectory.ground_coefficients.size == 0
-    filmed = Filmed(path_of(trajectory), trajectory.height, is_flat)
-    poses = (trajectory.positions[step] for step in steps)
+    path, positions = path_of(trajectory), trajectory.positions[steps]
+    centres = path[steps]
+    radius = float(np.linalg.norm((positions - centres[:, None])[..., :2], axis=-1).max())
+    filmed = Filmed(path, trajectory.height, is_flat, centres, radius + _SHADOW_MARGIN * trajectory.height)
+    poses = iter(positions)
     return rendered_frames(
         deformer.deform, deformer.rest, poses, filmed, cameras, shot, scene=scene, shadow=shadow, light=light
     )
@@ -270,6 +276,11 @@ class Filmed:
     """Height of the highest body, m."""
     is_flat: bool = True
     """True if the ground is flat and hides what is below it."""
+    centres: np.ndarray | None = None
+    """(n, 3) m, centre of mass of the body in each frame; None for several bodies."""
+    body_reach: float | None = None
+    """Radius of a disc around each of the ``centres`` that contains the shadow straight below the body, m; None for
+    several bodies."""
 
 
 def path_of(trajectory: Trajectory) -> np.ndarray:
@@ -308,21 +319,20 @@ def rendered_frames(
         cloud = deformed.cloud if relighter is None else relighter.relight(deformed.cloud, deformed.rotations)
         marks.append(perf_counter())
         if setting is None or camera is not cameras[index - 1]:
-            setting = _backdrop_of(
-                filmed.path, filmed.height, camera, scene, shot, grain=grain, shadow=shadow, light=light, device=device
-            )
-        image, shade = _rendered(cloud, setting, transparent=shot.transparent, has_floor=filmed.is_flat)
+            setting = _backdrop_of(filmed, camera, scene, shot, grain=grain, shadow=shadow, light=light, device=device)
+        centre = None if filmed.centres is None else filmed.centres[index]
+        image, shade = _rendered(cloud, setting, centre, transparent=shot.transparent, has_floor=filmed.is_flat)
         marks.append(perf_counter())
         deforming, rendering = (1e3 * np.diff(marks)).tolist()
         yield Frame(image, shade, (deforming, rendering))
 
 
 def _rendered(
-    cloud: GaussianCloud, setting: Backdrop, *, transparent: bool, has_floor: bool
+    cloud: GaussianCloud, setting: Backdrop, centre: np.ndarray | None, *, transparent: bool, has_floor: bool
 ) -> tuple[RenderedImage, wp.array | None]:
     """Return the image of ``cloud`` over its backdrop, and the opacity of its shadow if the shot is transparent."""
-    shade = setting.shadow_opacity(cloud) if transparent else None
-    backdrop = setting.background(cloud) if shade is None else (0.0, 0.0, 0.0)
+    shade = setting.shadow_opacity(cloud, centre) if transparent else None
+    backdrop = setting.background(cloud, centre) if shade is None else (0.0, 0.0, 0.0)
     depth = setting.floor_depth if has_floor else None
     image = render_gaussians(cloud, setting.shadow.camera, background=backdrop, max_depth=depth)
     wp.synchronize_device(cloud.device)
@@ -344,15 +354,15 @@ def picture_seconds(creature: Creature, *, size: tuple[int, int], shadow: bool =
     )
     camera = framed(resized(camera, *size), positions)
     deformer = Deformer(creature.cloud, embed_gaussians(creature.cloud, creature.cage.mesh))
-    grain, path = shadow_blur_radius(creature.cloud), creature.body.centre_of_mass(positions)[None]
+    grain, filmed = shadow_blur_radius(creature.cloud), Filmed(creature.body.centre_of_mass(positions)[None], height)
     setting = _backdrop_of(
-        path, height, camera, None, Shot(), grain=grain, shadow=shadow, light=None, device=creature.cloud.device
+        filmed, camera, None, Shot(), grain=grain, shadow=shadow, light=None, device=creature.cloud.device
     )
     spent = []
     # The first picture may compile kernels.
     for _ in range(2):
         started = perf_counter()
-        image, shade = _rendered(deformer.deform(positions).cloud, setting, transparent=False, has_floor=True)
+        image, shade = _rendered(deformer.deform(positions).cloud, setting, None, transparent=False, has_floor=True)
         Frame(image, shade, (0.0, 0.0)).picture()
         spent.append(perf_counter() - started)
     return spent[-1]
@@ -370,8 +380,7 @@ def _over_white(image: np.ndarray) -> np.ndarray:
 
 
 def _backdrop_of(
-    path: np.ndarray,
-    height: float,
+    filmed: Filmed,
     camera: Camera,
     scene: GaussianCloud | None,
     shot: Shot,
@@ -384,8 +393,7 @@ def _backdrop_of(
     """Return the backdrop of a shot.
 
     Args:
-        path: (F + 1, 3) m, path of the centre of mass.
-        height: Height of the body, m.
+        filmed: Extent of the motion.
         camera: Camera of the frame.
         scene: Gaussians behind the creature, in the frame of the body.
         shot: Background colour and transparency.
@@ -394,6 +402,7 @@ def _backdrop_of(
         light: Main light, in the axes of the body; None for a shadow straight down.
         device: Warp device.
     """
+    path, height = filmed.path, filmed.height
     com = path.mean(axis=0)
     centre = com * [1.0, 1.0, 0.0]
     reach = 2.2 * (height + float(np.linalg.norm(np.ptp(path, axis=0))))
@@ -405,6 +414,7 @@ def _backdrop_of(
             reach=reach,
             blur_radius=grain,
             height=height,
+            body_reach=filmed.body_reach,
             light=light,
             shadow=shadow,
         )
@@ -416,6 +426,7 @@ def _backdrop_of(
         device=device,
         blur_radius=grain,
         height=height,
+        body_reach=filmed.body_reach,
         light=light,
     )
     if is_plain:

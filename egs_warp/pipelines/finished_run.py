@@ -32,6 +32,8 @@ from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.shot import nearest_steps
 from egs_warp.short_repr import short_repr
 
+BACKGROUND = "background.ply"
+"""Gaussians behind the creature, in the frame and units of the capture."""
 PARTS = "trajectory.parts"
 """Folder that receives the steps of a run while it is simulated; it is removed when the run has finished."""
 
@@ -95,7 +97,7 @@ class FinishedRun:
         report = parse_json(read_text(folder / "report.json"), folder / "report.json")
         if not isinstance(report, dict):
             raise UserError(f"{folder / 'report.json'}: is not a report; run egs-warp animate again to write it")
-        own_background = folder / "background.ply"
+        own_background = folder / BACKGROUND
         file = background or (own_background if own_background.is_file() else None)
         scene = None
         if file is not None:

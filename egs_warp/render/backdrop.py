@@ -48,21 +48,23 @@ class Backdrop:
     """(H W,) float32, z-depth of an opaque floor that hides what is below it, 0 where there is none; None if there is
     no such floor."""
 
-    def shadow_opacity(self, body: GaussianCloud) -> wp.array:
-        """Return (H, W) float32, 0 to about 0.5, the opacity of the shadow of ``body``."""
+    def shadow_opacity(self, body: GaussianCloud, centre: np.ndarray | None = None) -> wp.array:
+        """Return (H, W) float32, 0 to about 0.5, the opacity of the shadow of ``body``; ``centre`` is as for
+        ``ContactShadow.cover``."""
         camera = self.shadow.camera
         if self.strengths is None:
             return wp.zeros((camera.height, camera.width), dtype=wp.float32, device=self.shadow.device)
-        return self.shadow.cover(body, self.strengths).reshape((camera.height, camera.width))
+        return self.shadow.cover(body, self.strengths, centre).reshape((camera.height, camera.width))
 
-    def background(self, body: GaussianCloud) -> wp.array:
-        """Return (H, W) vec3, the background with the shadow of ``body``."""
+    def background(self, body: GaussianCloud, centre: np.ndarray | None = None) -> wp.array:
+        """Return (H, W) vec3, the background with the shadow of ``body``; ``centre`` is as for
+        ``ContactShadow.cover``."""
         camera, device = self.shadow.camera, self.shadow.device
         shape = (camera.height, camera.width)
         if self.strengths is None:
             return self.unshadowed.reshape(shape)
         colour = empty(len(self.unshadowed), wp.vec3, device)
-        cover = self.shadow.cover(body, self.strengths)
+        cover = self.shadow.cover(body, self.strengths, centre)
         launch_rows(kernels.dim_kernel, len(colour), inputs=[self.unshadowed, cover], outputs=[colour], device=device)
         return colour.reshape(shape)
 
@@ -114,6 +116,7 @@ def captured_scene(
     reach: float,
     blur_radius: float,
     height: float,
+    body_reach: float | None = None,
     light: MainLight | None = None,
     shadow: bool = True,
 ) -> Backdrop:
@@ -124,7 +127,7 @@ def captured_scene(
         camera: camera.
         plane: ground.
         centre, reach: (3,) and radius of the disc that can be in shadow, world units.
-        blur_radius, height, light: as for ``ContactShadow``.
+        blur_radius, height, body_reach, light: as for ``ContactShadow``.
         shadow: False for no shadow.
     """
     import cv2
@@ -139,6 +142,7 @@ def captured_scene(
         device=scene.device,
         blur_radius=blur_radius,
         height=height,
+        body_reach=body_reach,
         depth=np.asarray(cv2.medianBlur(depth, 5)),
         light=light,
     )

@@ -69,9 +69,10 @@ class ShadowMap:
             light: main light, world axes; None casts straight down.
         """
         self.device = device
+        self._plane, self._light = plane, light
         self.ground = _ground(plane, centre, reach, light)
         self._layers = kernels.Layers()
-        texel = 2.0 * reach / _MAP
+        self._texel = texel = 2.0 * reach / _MAP
         if light is None:
             edges, blurs = np.array([layer[:2] for layer in _LAYERS]), np.array([layer[2] for layer in _LAYERS])
             # Higher layers block less of the sky, so they darken less.
@@ -86,15 +87,26 @@ class ShadowMap:
         self._grain = _taps(np.full(len(_LAYERS), blur_radius) / texel, device)
         self._blur = _taps(height * blurs / texel, device)
 
-    def of(self, body: GaussianCloud) -> wp.array:
-        """Return the shadow (texels, texels) float32 of ``body`` on the plane, seen from above; 1 is full shadow."""
+    def shift_to(self, centre: np.ndarray) -> np.ndarray:
+        """Return the displacement (2,), whole texels, that moves the centre of the map to ``centre`` (3,). Whole texels
+        keep the texels in place on the ground, so that a moving shadow does not flicker."""
+        away = np.array(self._plane.tangents()) @ (centre - np.array(self.ground.centre))
+        return np.rint(away / self._texel)
+
+    def of(self, body: GaussianCloud, shift: np.ndarray | None = None) -> wp.array:
+        """Return the shadow (texels, texels) float32 of ``body`` on the plane, seen from above; 1 is full shadow. The
+        map is displaced by ``shift`` (2,) texels."""
+        ground = self.ground
+        if shift is not None:
+            centre = np.array(ground.centre) + self._texel * shift @ np.array(self._plane.tangents())
+            ground = _ground(self._plane, centre, ground.reach, self._light)
         shape = (len(_LAYERS), _MAP, _MAP)
         coverage = zeros(shape, wp.int64, self.device)
         # Use one thread on a CPU, where concurrent additions to one texel are not atomic.
         launch_cached(
             kernels.coverage_kernel,
             body.count,
-            inputs=[self.ground, self._layers, body.means, body.log_scales, body.opacity_logits],
+            inputs=[ground, self._layers, body.means, body.log_scales, body.opacity_logits],
             outputs=[coverage],
             device=self.device,
         )
@@ -116,10 +128,12 @@ class ShadowMap:
         across = flat[:, :2] - (flat[:, 2] + ground.rise)[:, None] * np.array(ground.slope)
         return 0.5 * _MAP * (across / ground.reach + 1.0)
 
-    def cover(self, shade: wp.array, texels: wp.array, strength: wp.array) -> wp.array:
-        """Return (n,) float32, the shadow map ``shade`` at ``texels`` (n,) vec2, times ``strength`` (n,)."""
+    def cover(self, shade: wp.array, texels: wp.array, strength: wp.array, shift: np.ndarray | None = None) -> wp.array:
+        """Return (n,) float32, the shadow map ``shade``, displaced by ``shift`` (2,) texels, at ``texels`` (n,) vec2,
+        times ``strength`` (n,)."""
         cover = empty(len(strength), wp.float32, self.device)
-        self._launch(kernels.shadow_opacity_kernel, len(strength), [shade, texels, strength], [cover])
+        moved = wp.vec2() if shift is None else wp.vec2(*shift.tolist())
+        self._launch(kernels.shadow_opacity_kernel, len(strength), [shade, texels, moved, strength], [cover])
         return cover
 
     def _blur_layers(self, layers: wp.array, scratch: wp.array, taps: list[wp.array]) -> None:
@@ -150,6 +164,7 @@ class ContactShadow:
         device: wp.Device,
         blur_radius: float = 0.0,
         height: float = 0.0,
+        body_reach: float | None = None,
         depth: np.ndarray | None = None,
         light: MainLight | None = None,
     ) -> None:
@@ -162,6 +177,9 @@ class ContactShadow:
             device: device of the arrays.
             blur_radius: world units, blur radius of the body, see ``shadow_blur_radius``; 0 without a body.
             height: height of the body, world units; 0 without a body.
+            body_reach: radius of a disc that contains the shadow straight below the body, world units. The map of that
+                shadow then has this radius, and ``cover`` moves it with the body, so that the shadow is as sharp in a
+                long motion as in a short one. None for one map of the whole disc.
             depth: (H, W) z-depth of the uneven ground that receives the shadow, 0 where the plane receives it.
             light: main light, world axes; None without one.
         """
@@ -180,19 +198,23 @@ class ContactShadow:
         uneven = np.zeros(count) if depth is None else depth.ravel()
         self._surface_depth = wp.array(uneven, dtype=wp.float32, device=device)
         body = {"device": device, "blur_radius": blur_radius, "height": height}
-        maps = [ShadowMap(plane, centre=centre, reach=reach, **body)]
+        map_reach = reach if body_reach is None else min(body_reach, reach)
+        self._moves = map_reach < reach
+        maps = [ShadowMap(plane, centre=centre, reach=map_reach, **body)]
+        fades = [reach]
         opacities = [1.0]
         if light is not None and light.shade > 0.0:
             # Relative to the disc's centre, the light's map is displaced by half of the shadow's displacement at body
             # height, and its radius is larger by the same length.
             half = 0.5 * height * _slope(plane, light)
             moved = centre - np.stack(plane.tangents(), axis=1) @ half
-            maps.append(ShadowMap(plane, centre=moved, reach=reach + float(np.linalg.norm(half)), light=light, **body))
+            fades.append(reach + float(np.linalg.norm(half)))
+            maps.append(ShadowMap(plane, centre=moved, reach=fades[-1], light=light, **body))
             opacities = [1.0 - light.shade, light.shade]
         outputs = [self.depth, self.flat, self.fade, self.pixel, self.surface_height]
         self._receivers = []
-        for one, opacity in zip(maps, opacities, strict=True):
-            texels = self._on_ground(one, outputs)
+        for one, fade, opacity in zip(maps, fades, opacities, strict=True):
+            texels = self._on_ground(one, fade, outputs)
             self._receivers.append(_Receiver(one, texels, outputs[2], opacity))
             outputs = [empty(len(output), output.dtype, device) for output in outputs]
 
@@ -205,18 +227,24 @@ class ContactShadow:
             for one in self._receivers
         ]
 
-    def cover(self, body: GaussianCloud, strengths: list[wp.array]) -> wp.array:
-        """Return (H W,) float32, the opacity of the shadow of ``body`` with the ``strengths`` of each shadow."""
+    def cover(self, body: GaussianCloud, strengths: list[wp.array], centre: np.ndarray | None = None) -> wp.array:
+        """Return (H W,) float32, the opacity of the shadow of ``body`` with the ``strengths`` of each shadow.
+        ``centre`` (3,) is the centre of the body, needed with ``body_reach``."""
+        shifts: list[np.ndarray | None] = [None] * len(self._receivers)
+        if self._moves:
+            assert centre is not None, "a shadow map with body_reach requires the centre of the body"
+            shifts[0] = self._receivers[0].shadow_map.shift_to(centre)
         covers = [
-            one.shadow_map.cover(one.shadow_map.of(body), one.texels, strength)
-            for one, strength in zip(self._receivers, strengths, strict=True)
+            one.shadow_map.cover(one.shadow_map.of(body, shift), one.texels, strength, shift)
+            for one, strength, shift in zip(self._receivers, strengths, shifts, strict=True)
         ]
         for other in covers[1:]:
             launch_rows(kernels.join_covers_kernel, len(other), inputs=[other], outputs=[covers[0]], device=self.device)
         return covers[0]
 
-    def _on_ground(self, shadow_map: ShadowMap, outputs: list[wp.array]) -> wp.array:
-        """Compute the ground of every pixel into ``outputs``; return its position (H W,) vec2 in the map."""
+    def _on_ground(self, shadow_map: ShadowMap, fade_reach: float, outputs: list[wp.array]) -> wp.array:
+        """Compute the ground of every pixel into ``outputs``; return its position (H W,) vec2 in the map. The shadow
+        has faded at the distance ``fade_reach``."""
         camera, count = self.camera, len(self.depth)
         texels = empty(count, wp.vec2, self.device)
         ground = shadow_map.ground
@@ -227,6 +255,7 @@ class ContactShadow:
                 view_from_camera(camera),
                 ground,
                 wp.vec3(*(camera.centre - np.array(ground.centre)).tolist()),
+                fade_reach,
                 self._surface_depth,
             ],
             outputs=[*outputs, texels],

@@ -15,7 +15,7 @@ from egs_warp.motions.walk import Walk
 
 KNOWN = (
     "jump, hop, twist, walk, walk to, walk along, run, turn, drive, stand, get up, dance, trajectory, nod, shake,"
-    " look around, wave, bow, groove, sneak, skip, spin, land and pose"
+    " look around, wave, bow, groove, sneak, skip, spin, 'land and pose'"
 )
 
 
@@ -136,6 +136,14 @@ def test_motions_along_paths_are_parsed(tmp_path: Path) -> None:
         ("hop x0", "motion 1 ('hop x0'): repeat 0; give a whole number from 1 to 100"),
         ("jump 1 2 3", "motion 1 ('jump 1 2 3'): '3' is one value too many; jump takes distance, height"),
         ("hop, jump far", "motion 2 ('jump far'): distance far: give a number of body heights from 0 to 10"),
+        (
+            "jump then walk",
+            "motion 1 ('jump then walk'): 'then' is not a number; separate motions by commas, and add a gesture on top"
+            " of a motion by +, as in 'jump, walk 1 + nod'",
+        ),
+        ("walk 1 0.1 1 Wave", "motion 1 ('walk 1 0.1 1 Wave'): 'Wave' is not a number; separate motions by commas"),
+        ("land", "motion 1: unknown motion 'land' (did you mean 'land and pose'?); known motions are: jump, hop, "),
+        ("jump height=", "('jump height='): height without a value: give a number of body heights above 0 up to 10"),
         ("jump nan", "motion 1 ('jump nan'): distance nan: give a number of body heights from 0 to 10"),
         ("twist 9999", "('twist 9999'): heading_degrees 9999: give a number of degrees from -720 to 720"),
         ("jump height=0", "('jump height=0'): height 0: give a number of body heights above 0 up to 10"),

@@ -49,6 +49,18 @@ def test_a_jump_s_plan_crouches_rises_as_requested_and_ends_at_touch_down() -> N
     assert path[known][-1] @ jump.ground.axes[0] > 0.5 * jump.target.distance
 
 
+def test_the_plan_of_a_later_jump_begins_with_its_crouch() -> None:
+    """The body settles once, at the start of the run: the plan of a jump that starts later is not delayed."""
+    sequence, _, _ = standing("jump", 2.5)
+    place, first = block_place(), sequence.done[0].motion
+    later = Jump(place, cast(Jump, first).target)
+    later.objectives(BodyState(place.standing, np.zeros_like(place.standing), 5.0), None, DT)
+    settling = 0.3 * np.sqrt(place.body.height / later.gravity)
+    for time in (0.5 * later.plan.crouch_time, later.plan.crouch_time + 0.5 * later.plan.flight_time):
+        assert later.planned_com(time) == pytest.approx(first.planned_com(time + settling))
+    assert later.planned_com(0.5 * later.plan.crouch_time)[2] < -0.3 * later.plan.crouch_depth
+
+
 @pytest.mark.parametrize("name", ["hop", "twist 90"])
 def test_hops_and_twists_have_the_plan_of_their_jump(name: str) -> None:
     sequence, t, start = standing(name, 2.5)

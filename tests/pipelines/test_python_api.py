@@ -4,6 +4,7 @@ that the user defines."""
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -122,6 +123,18 @@ class Still:
 
     def notes(self) -> list[str]:
         return ["nothing was to be done"]
+
+
+def test_the_motion_of_the_guide_sways_to_the_left_first(creature: egs.Creature) -> None:
+    guide = (Path(__file__).parents[2] / "docs" / "motions" / "scripts.md").read_text()
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", guide, re.DOTALL) if "def sway" in block]
+    names: dict[str, Any] = {}
+    exec(code, names)
+    run = egs.simulate(creature, names["script"], frames=40)
+    assert [request.name for request in names["script"].requests] == ["sway", "nod"]
+    mass, left = run.trajectory.node_mass, run.place.ground.axes[1]
+    displacement = (mass / mass.sum()) @ (run.frames - run.frames[0]) @ left / run.creature.body.height
+    assert 0.02 < displacement.max() < 0.06 and displacement.min() > -0.01
 
 
 def test_a_motion_of_ones_own_needs_no_file(creature: egs.Creature, capture: egs.Capture, tmp_path: Path) -> None:

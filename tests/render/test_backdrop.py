@@ -150,6 +150,28 @@ def test_the_shadow_equals_the_reference(tilt: float, device: str) -> None:
     assert np.abs(square(found) - expected).mean() < 1e-4
 
 
+@pytest.mark.parametrize("step", [0.0, 0.4])
+def test_a_shadow_is_as_sharp_in_a_long_motion_as_in_a_short_one(step: float) -> None:
+    """A map that moves with the body gives the shadow of a small disc at the body, also when the body is not at the
+    centre of the image; one map of the whole disc does not."""
+    ball, _ = parts()
+    place = np.array([step, 0.25 * step, 0.0])
+    body = placed(ball, ball.means.numpy() + place)
+    options = {"device": body.device, "blur_radius": shadow_blur_radius(body), "height": 1.0}
+    short = ContactShadow(camera(), FLOOR, centre=place, reach=2.0, **options)
+    # A whole number of texels away from the body, so that the texels of both maps coincide.
+    far = place - 300.0 * (4.0 / 192.0) * np.array([1.0, 0.0, 0.0])
+    moving, fixed = (
+        ContactShadow(camera(), FLOOR, centre=far, reach=30.0, body_reach=reach, **options) for reach in (2.0, None)
+    )
+    covers = [square(one.cover(body, one.strengths(), place)) for one in (short, moving, fixed)]
+    inside = np.linalg.norm(square(short.flat), axis=-1) < 0.7
+    expected, found, coarse = (cover[inside] for cover in covers)
+    assert expected.max() > 0.3
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+    assert np.abs(coarse - expected).max() > 0.1
+
+
 def test_a_floor_has_lines_and_turns_into_the_sky_without_an_edge(device: str) -> None:
     """Fine lines are one cell apart; without a shadow the floor is the same under a body."""
     body, _ = parts()

@@ -19,6 +19,15 @@ from tests.support.live_pages import in_browser
 from tests.support.packets import read_packets
 from tests.support.pages import served
 
+_KEEP_STILL_WIDTH = """{
+    const { remove } = Element.prototype;
+    Element.prototype.remove = function () {
+        if (this.classList.contains("still")) window.stillWidth = this.naturalWidth;
+        remove.call(this);
+    };
+}"""
+"""JavaScript that records the width of the picture that a page shows while it loads, when it is removed."""
+
 
 @pytest.mark.parametrize("scale", [1.0, 40.0])
 def test_the_capture_stands_upright_and_is_one_high(scale: float):
@@ -71,10 +80,11 @@ def test_stages_come_in_order_and_the_session_follows():
 
 @in_browser
 def test_the_page_shows_the_capture_at_once_and_then_the_creature(chromium: Any, session: Session):
+    """The picture of the capture covers the page until the creature is drawn."""
     scene = pawn(gaussian_count=2000)
     feed = PreviewFeed(preview_of(scene.cloud, title="pawn", plane=scene.plane))
     with served(feed=feed) as server:
-        page, complaints = opened(chromium, server.address)
+        page, complaints = opened(chromium, server.address, scripts=[_KEEP_STILL_WIDTH])
         feed.show_stage("cage")
         wait_until(page, "document.querySelector('.status').textContent === 'Preparing the body: cage\\u2026'")
         feed.show_error("the capture is too flat")
@@ -83,5 +93,6 @@ def test_the_page_shows_the_capture_at_once_and_then_the_creature(chromium: Any,
         with page.expect_navigation():
             feed.start(LiveFeed(session))
         wait_until(page, "window.egs?.live?.state !== undefined")
+        wait_until(page, "window.stillWidth > 100 && document.querySelector('.still') === null")
         assert complaints == []
         page.close()

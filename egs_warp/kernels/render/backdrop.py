@@ -69,6 +69,7 @@ def ground_kernel(
     view: View,
     ground: Ground,
     eye: wp.vec3,
+    fade_reach: wp.float32,
     surface_depth: wp.array[wp.float32],
     # Out:
     depth_out: wp.array[wp.float32],
@@ -84,10 +85,11 @@ def ground_kernel(
         view: camera.
         ground: plane and disc.
         eye: camera centre relative to the centre of the disc.
+        fade_reach: distance from the centre at which the shadow has faded.
         surface_depth: z-depth of the visible surface, 0 where the visible surface is the plane.
         depth_out: z-depth of the plane, 0 where the ray does not meet it from above.
         flat_out: position on the plane relative to the centre, along its axes.
-        fade_out: 1 at the centre, 0 from ``reach`` on.
+        fade_out: 1 at the centre, 0 from ``fade_reach`` on.
         pixel_out: size of a pixel on the plane.
         lift_out: height of the visible surface over the plane.
         texel_out: map position behind the visible surface.
@@ -105,7 +107,7 @@ def ground_kernel(
     flat = wp.vec2(wp.dot(place, ground.first), wp.dot(place, ground.second))
     fade = wp.float32(0.0)
     if depth > 0.0:
-        fade = wp.clamp(1.6 - 1.6 * wp.length(flat) / ground.reach, 0.0, 1.0)
+        fade = wp.clamp(1.6 - 1.6 * wp.length(flat) / fade_reach, 0.0, 1.0)
     if surface_depth[tid] > 0.0:
         place = eye + surface_depth[tid] * ray
     depth_out[tid] = depth
@@ -318,16 +320,18 @@ def shadow_opacity_kernel(
     # In:
     shade: wp.array2d[wp.float32],
     texel: wp.array[wp.vec2],
+    shift: wp.vec2,
     strength: wp.array[wp.float32],
     # Out:
     shadow_opacity_out: wp.array[wp.float32],
 ):
-    """Compute the shadow opacity of every pixel by bilinear interpolation of the map."""
+    """Compute the shadow opacity of every pixel by bilinear interpolation of the map, which is displaced by ``shift``
+    texels."""
     tid = wp.tid() + first_row
     cover = wp.float32(0.0)
     if strength[tid] > 0.0:
-        u = wp.clamp(texel[tid][0] - 0.5, -2.0, wp.float32(TEXELS) + 1.0)
-        v = wp.clamp(texel[tid][1] - 0.5, -2.0, wp.float32(TEXELS) + 1.0)
+        u = wp.clamp(texel[tid][0] - shift[0] - 0.5, -2.0, wp.float32(TEXELS) + 1.0)
+        v = wp.clamp(texel[tid][1] - shift[1] - 0.5, -2.0, wp.float32(TEXELS) + 1.0)
         column = wp.int32(wp.floor(u))
         row = wp.int32(wp.floor(v))
         right = u - wp.floor(u)

@@ -2,6 +2,7 @@
 
 import { element } from "./dom";
 import { Page } from "./page";
+import { showStill } from "./still";
 import { fromAddress, fromElement, fromSocket, type FrameSource } from "./frame_source";
 import "./controls.css";
 import "./style.css";
@@ -47,9 +48,13 @@ declare global {
 async function start(): Promise<void> {
   const root = document.getElementById("page") as HTMLElement;
   showMessage(LOADING);
+  const fadeStill = showStill();
   try {
     window.egs = new Page(root, await findRuns());
+    await window.egs.drawn;
+    fadeStill();
   } catch (error) {
+    fadeStill();
     showMessage(error instanceof Error ? error.message : String(error));
   }
 }

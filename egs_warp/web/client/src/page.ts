@@ -81,6 +81,8 @@ export class Page {
   private readonly checkboxes = new Map<LayerToggle, HTMLInputElement>();
   /** True once the splats of the first image have been sorted. */
   private isDrawn = false;
+  /** Resolves once the first image is drawn with sorted splats. */
+  readonly drawn: Promise<void>;
   private lastTime = 0;
   /** Smoothed time between two images during playback, s. */
   private frameTime = 0;
@@ -105,7 +107,7 @@ export class Page {
       this.viewers.push(viewer);
     }
     const preparation =
-      first instanceof LiveSource && first.header.facts.preparing ? new Preparation(first) : undefined;
+      first instanceof LiveSource && first.header.facts.preparing ? new Preparation(first, this.first) : undefined;
     if (first instanceof LiveSource && first.header.facts.picking) {
       this.pick = new Pick(first, this.first);
     } else if (first instanceof LiveSource && preparation === undefined) {
@@ -144,7 +146,7 @@ export class Page {
     const isStill = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.player.playing = this.live === undefined && this.player.lastFrame > 0 && !isStill;
     this.update();
-    void Promise.all(this.viewers.map((viewer) => viewer.drawSorted())).then(() => {
+    this.drawn = Promise.all(this.viewers.map((viewer) => viewer.drawSorted())).then(() => {
       this.isDrawn = true;
     });
     // In a headset, this is the animation loop of its session.

@@ -2,17 +2,24 @@
 
 import { element } from "./dom";
 import type { LiveSource, News } from "./frame_source";
+import { keepStill } from "./still";
+import type { Viewer } from "./viewer";
 
 export class Preparation {
   readonly element = element("p", { class: "dock status", role: "status", "aria-live": "polite" });
 
-  constructor(source: LiveSource) {
+  constructor(
+    source: LiveSource,
+    private readonly viewer: Viewer,
+  ) {
     source.listen((news) => this.handleNews(news));
   }
 
   private handleNews(news: News): void {
-    if (news.type === "ready") location.reload();
-    else if (news.type === "preparing") {
+    if (news.type === "ready") {
+      keepStill(this.viewer.picture());
+      location.reload();
+    } else if (news.type === "preparing") {
       this.element.textContent = `Preparing the body${news.stage === "" ? "" : `: ${news.stage}`}\u2026`;
     } else if (news.type === "failed") {
       this.element.textContent = news.text;

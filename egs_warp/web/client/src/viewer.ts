@@ -251,6 +251,12 @@ export class Viewer extends Stage {
     });
   }
 
+  /** Return a JPEG image of the current view as an address. */
+  picture(): string {
+    this.render();
+    return this.canvas.toDataURL("image/jpeg", 0.9);
+  }
+
   /** Brighten the splats of the object `active`; `labels` contains the number of each splat's object, 0 for none. */
   mark(labels: Uint8Array, active: number): void {
     this.bodies.mark(labels, active);
