@@ -55,6 +55,9 @@ _GAP_EDGE = 6.0
 """Width, in texels, of the unreliable floor around a gap; it is filled with the gap."""
 _CHANNEL = 9.0
 """Half width, in texels. A channel narrower than this does not connect a gap to the empty space beyond the floor."""
+_EDGE_BAND = 0.1
+"""Distance from the edge of the floor within which Gaussians below the floor belong to its side, as a fraction of the
+hole's side."""
 _MIN_RIM_FRACTION = 0.4
 """Minimum fraction of the hole's edge that must be floor."""
 _MAX_ISLAND_AREA = 0.15
@@ -144,19 +147,21 @@ def inpaint(
     inpainter = inpainter or PatchSynthesis(seed=options.seed, device=str(background.device))
     clock = _Clock()
     window, grown, spacing = _window_around(background, hole, options.margin)
-    thickness = _THICKNESS * hole.bounds()[1]
-    junk = _in_hole(background, window, grown, hole.bounds()[1])
+    side = hole.bounds()[1]
+    thickness = _THICKNESS * side
+    junk = _in_hole(background, window, grown, side)
     if junk.all():
         raise UserError("inpaint: the hole covers the whole capture; make it smaller")
     retained = background.subset(~junk)
     before = rectify(retained, window, thickness=thickness)
-    grown, known = _closed(grown, before.alpha)
+    grown, known, void = _closed(grown, before.alpha)
     _check(grown, known)
-    # The gaps that were added to the hole contain haze, too.
-    junk = _in_hole(background, window, grown, hole.bounds()[1])
+    # The gaps that were added to the hole contain haze, too. What lies below the floor at its edge is its side, for
+    # example that of a table or of a pedestal.
+    inner = grown & (distance_to(void) > _EDGE_BAND * _TEXELS_ACROSS) if void.any() else grown
+    junk = _in_hole(background, window, inner, side)
     grown, known, stained = _without_stain(grown, known, before)
-    # Stains lie on the floor; Gaussians far below it belong to a table's side.
-    junk |= _in_hole(background, window, grown, hole.bounds()[1], depth=_THICKNESS)
+    junk |= _in_hole(background, window, grown, side, depth=_THICKNESS)
     if junk.all():
         raise UserError("inpaint: the hole covers the whole capture; make it smaller")
     retained = background.subset(~junk)
@@ -270,22 +275,23 @@ def _in_hole(
     return window.sample(mask, means) & (heights > -depth * side) & (heights < _HAZE * side)
 
 
-def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the hole enlarged by adjacent gaps and by islands of floor inside it, and the known floor; both (rows,
-    columns) bool."""
+def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the hole enlarged by adjacent gaps and by islands of floor inside it, the known floor, and the empty space
+    beyond the edge of the floor; all (rows, columns) bool."""
     # Pinholes between splats are not gaps.
     closed: Any = ndimage.binary_closing(np.pad(alpha > _KNOWN, 4, mode="edge"), iterations=2)
     solid = np.asarray(closed[4:-4, 4:-4])
     near = distance_to(mask) < _GAP_REACH * _TEXELS_ACROSS
-    gaps, _ = connected_parts(mask | (~solid & near & ~_void(~solid & ~mask)))
+    void = _void(~solid & ~mask)
+    gaps, _ = connected_parts(mask | (~solid & near & ~void))
     touching = np.isin(gaps, np.unique(gaps[mask])) & ~mask
     # The floor is stained where it becomes thin, next to a gap.
-    hole = mask | (distance_to(touching) < _GAP_EDGE if touching.any() else touching)
+    hole = mask | (distance_to(touching) < _GAP_EDGE if touching.any() else touching) & ~void
     parts, count = connected_parts(~hole)
     sizes = np.bincount(parts.ravel(), minlength=count + 1)
     islands = (sizes < _MAX_ISLAND_AREA * hole.sum()) & (np.arange(count + 1) > 0)
     hole |= islands[parts]
-    return hole, solid & ~hole
+    return hole, solid & ~hole, void
 
 
 def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) -> tuple[np.ndarray, np.ndarray, float]:
@@ -297,7 +303,7 @@ def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) 
     stain = stain_around(hole, known, before.colour)
     if not stain.any():
         return hole, known, 0.0
-    whole, left = _closed(hole | stain, before.alpha)
+    whole, left, _ = _closed(hole | stain, before.alpha)
     try:
         _check(whole, left)
     except UserError:

@@ -17,7 +17,6 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import Foot, SupportKind, find_feet, support_kind_of
-from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.limbs import Limbs
 from egs_warp.motions.stance import GroundFrame, heading_between, sole_shares
 from egs_warp.motions.style import Style
@@ -112,17 +111,6 @@ class Stance:
         it; 0 without a surface."""
         rise = surface_above(self.solids, point, self.ground.axes[2])
         return rise if np.isfinite(rise) else 0.0
-
-    def landing(self, target: JumpTarget) -> JumpTarget:
-        """Return ``target`` with the rise of the surface on which the feet will land. The jump clears the surface by at
-        least half of the requested height. The target is unchanged without a surface, or if the surface is higher than
-        the jump, such as a wall or a lintel."""
-        feet, up = sole_shares(self.body, self.ground, self.standing) @ self.standing, self.ground.axes[2]
-        ahead = surface_above(self.solids, feet + target.distance * self.ground.axes[0], up)
-        rise = ahead - surface_above(self.solids, feet, up)
-        if not np.isfinite(rise) or rise > target.height:
-            return target
-        return replace(target, rise=rise, height=max(target.height, rise + 0.5 * target.height))
 
     def with_forward(self, direction: np.ndarray) -> Stance:
         """Return the same stance with another forward ``direction`` (3,); the body is not rotated."""
@@ -238,13 +226,20 @@ class MotionSequence:
         return self.done[-1].motion.objectives(state, report, dt)
 
     def start_next(self, state: BodyState, report: StepReport | None) -> None:
-        """Start the next motion at ``state``; ``report`` is the report of the previous step."""
+        """Start the next motion at ``state``; ``report`` is the report of the previous step. A motion whose target is
+        out of reach is replaced by a short stand, whose result is the missed target."""
+        from egs_warp.motions.stand import StandInstead
+
         stance = self._stance.next_stance(state.positions, report) if self.done else self._stance
         if stance.base() is SupportKind.ROUND_BASE:
             self._stance = stance
         part = self._parts.pop(0)
         self._is_dropped = self._gets_up_next = False
-        self.done.append(MotionRecord(part.name, part.asked, part.begin(stance), state.time))
+        try:
+            motion: BodyMotion = part.begin(stance)
+        except TargetError as error:
+            motion = StandInstead(stance, str(error))
+        self.done.append(MotionRecord(part.name, part.asked, motion, state.time))
 
     def time_left(self, time: float, expected: Sequence[float]) -> float:
         """Estimate the time in seconds from ``time`` s until the body is at rest after the last motion; ``expected``

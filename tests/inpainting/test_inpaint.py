@@ -28,6 +28,7 @@ from egs_warp.segmentation.plane_fit import plane_depth
 from egs_warp.segmentation.votes import MaskedView
 from egs_warp.training.metrics import psnr
 from tests.support.floors import PLANE, floor, on_plane, pattern
+from tests.support.scenes import FLOOR, blocks, round_ones
 
 RADIUS = 0.22
 
@@ -236,6 +237,19 @@ def test_overhanging_objects_stay() -> None:
     )
     assert np.count_nonzero(PLANE.heights(result.cloud.means.numpy()) > RADIUS) == shelf.count
     assert result.removed == bare.removed > 0
+
+
+def test_the_sides_below_the_edge_of_a_floor_stay() -> None:
+    """The hole in the top of a block reaches 0.05 over its edge. All Gaussians of the sides stay; a Gaussian below the
+    middle of the hole is removed."""
+    block = blocks(((-0.5, -0.5, -0.6), (0.5, 0.5, 0.0)))
+    cloud = concatenate(block, round_ones(np.array([[0.1, 0.0, -0.3]]), 0.02))
+    hole = disc(FLOOR, np.array([0.1, 0.0, 0.0]), 0.45)
+    result = inpaint(cloud, hole, inpainter=OpenCvInpainter(), options=InpaintOptions(steps=0))
+    means = cloud.means.numpy()
+    is_side = (np.abs(means[:, :2]).max(axis=1) > 0.49) & (means[:, 2] < -0.15)
+    assert is_side.sum() > 1000 and result.is_retained[is_side].all()
+    assert not result.is_retained[-1]
 
 
 @pytest.mark.parametrize(
