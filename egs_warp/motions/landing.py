@@ -8,7 +8,6 @@ import numpy as np
 
 from egs_warp.contact.terrain import Solid, surface_above
 from egs_warp.motions.jump_plan import JumpTarget
-from egs_warp.motions.route_check import MAX_STEP_HEIGHT
 from egs_warp.motions.sequence import Stance, TargetError
 from egs_warp.motions.stance import sole_shares
 from egs_warp.motions.support import SupportPolygon
@@ -16,6 +15,9 @@ from egs_warp.motions.support import SupportPolygon
 _MIN_MARGIN = 0.5
 """Minimum distance of the centre of mass from the edge of the supported part of the base, relative to its distance from
 the edge of the whole base. A body that lands with less, and a little too far, tips over the edge."""
+_MAX_HOLLOW = 0.1
+"""Depth in body heights of the ground below a part of the base from which this part is not supported. Hollows of rough
+ground are less deep."""
 _MAX_DROP = 1.0
 """Maximum depth of the landing place below the start, body heights."""
 _TRIED = 20
@@ -54,11 +56,11 @@ def check_landing(stance: Stance, target: JumpTarget) -> None:
         if _is_supported(stance, distance, max(_rise(stance, distance), -2.0 * _MAX_DROP * height))
     ]
     # Round down, so that the distance of the advice is supported.
-    advice = (
-        f"a distance of at most {np.floor(100.0 * supported[0] / height) / 100.0:g}" if supported else "another way"
-    )
+    advice = "turn to another direction first"
+    if supported:
+        advice = f"give a distance of at most {np.floor(100.0 * supported[0] / height) / 100.0:g}"
     raise TargetError(
-        f"the ground ends where the body would land, {target.distance / height:.2g} body heights ahead; give {advice}"
+        f"the ground ends where the body would land, {target.distance / height:.2g} body heights ahead; {advice}"
     )
 
 
@@ -89,9 +91,9 @@ def _is_supported(stance: Stance, distance: float, rise: float) -> bool:
     lower = np.array(
         [surface_above(stance.solids, point, up) - surface_above(stance.solids, point + shift, up) for point in points]
     )
-    has_ground = lower < MAX_STEP_HEIGHT * height
+    has_ground = lower < _MAX_HOLLOW * height
     # A body that jumps down must not hit the edge that it has left.
-    if rise < -MAX_STEP_HEIGHT * height and (lower < -MAX_STEP_HEIGHT * height).any():
+    if rise < -_MAX_HOLLOW * height and (lower < -_MAX_HOLLOW * height).any():
         return False
     if has_ground.all() or not has_ground.any():
         return bool(has_ground.all())

@@ -50,8 +50,8 @@ def test_a_landing_on_the_edge_of_a_table_is_refused(place: Stance, floor: float
     the table or not. The distance of the advice is accepted."""
     below = () if floor is None else (Solid((Plane(UP, -floor),)),)
     asked = JumpTarget(0.5, 0.2)
-    across = np.linspace(-0.2, 0.2, 21)
-    base = np.stack([*np.meshgrid(across, across), np.zeros((21, 21))], axis=-1).reshape(-1, 3)
+    across = np.linspace(-0.2, 0.2, 11)
+    base = np.stack([*np.meshgrid(across, across), np.zeros((11, 11))], axis=-1).reshape(-1, 3)
     for edge in (0.63, 0.9):
         stance = replace(place, contact_points=base, solids=(table(edge), *below))
         assert landing_of(stance, asked) == asked
@@ -62,7 +62,7 @@ def test_a_landing_on_the_edge_of_a_table_is_refused(place: Stance, floor: float
         ) as caught:
             landing_of(stance, asked)
         best = float(str(caught.value).rpartition(" ")[2])
-        assert edge - 0.05 <= best + 0.1 <= edge
+        assert edge - 0.07 <= best + 0.1 <= edge
         assert landing_of(stance, JumpTarget(best, 0.2)).rise == 0.0
 
 
