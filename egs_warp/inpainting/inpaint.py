@@ -19,7 +19,7 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.bitmaps import connected_parts, depth_inside, distance_to
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, concatenate
 from egs_warp.inpainting.holes import Hole
-from egs_warp.inpainting.inpainters import Inpainter
+from egs_warp.inpainting.inpainters import Inpainter, OpenCvInpainter
 from egs_warp.inpainting.new_floor import flat_gaussians, rim_heights, with_gloss
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis, painting_time
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, diffuse_only, rectify
@@ -136,7 +136,8 @@ def inpaint(
     Args:
         background: the capture without the object.
         hole: region of the floor to fill.
-        inpainter: fills the face-on picture; ``PatchSynthesis`` by default.
+        inpainter: fills the face-on picture; by default ``PatchSynthesis``, or ``OpenCvInpainter`` if too little floor
+            is left to copy from.
         options: see ``InpaintOptions``.
         progress: called with the approximate share of the time that has passed, 0 to 1.
 
@@ -144,7 +145,7 @@ def inpaint(
         UserError: the hole is off the floor, too narrow, or leaves no floor to copy from.
     """
     options = options or InpaintOptions()
-    inpainter = inpainter or PatchSynthesis(seed=options.seed, device=str(background.device))
+    synthesis = PatchSynthesis(seed=options.seed, device=str(background.device))
     clock = _Clock()
     window, grown, spacing = _window_around(background, hole, options.margin)
     side = hole.bounds()[1]
@@ -176,9 +177,16 @@ def inpaint(
     show_painting(0.0)
     # Where there is no stain, there is no shadow either, and dark floor keeps its colour.
     shade = shaded(grown, known, before.colour) if stained else None
-    painted = inpainter.fill(
-        np.where(known[..., None], before.colour, 0.0), grown, known, shade, progress=show_painting
-    )
+    image = np.where(known[..., None], before.colour, 0.0)
+    notes: tuple[str, ...] = ()
+    try:
+        painted = (inpainter or synthesis).fill(image, grown, known, shade, progress=show_painting)
+    except UserError as error:
+        if inpainter is not None:
+            raise
+        # The rim of the floor is narrower than a patch.
+        painted = OpenCvInpainter().fill(image, grown, known)
+        notes = (f"the colours around the hole were continued smoothly ({error})",)
     clock.lap("inpaint")
     new = flat_gaussians(
         window,
@@ -212,7 +220,7 @@ def inpaint(
     new = with_gloss(new, retained.subset(floor), window)
     cloud = concatenate(retained, new)
     clock.lap("join")
-    notes = (
+    notes += (
         f"{int(junk.sum())} Gaussians in the hole were replaced by {new.count} on the plane",
         f"the hole is {grown.sum() * window.texel**2:.3g} square scene units; a texel is {window.texel:.3g} wide",
         *((f"{100 * stained:.0f} % of the hole was floor stained by the object's shadow or foot",) if stained else ()),
@@ -285,8 +293,11 @@ def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray
     void = _void(~solid & ~mask)
     gaps, _ = connected_parts(mask | (~solid & near & ~void))
     touching = np.isin(gaps, np.unique(gaps[mask])) & ~mask
-    # The floor is stained where it becomes thin, next to a gap.
-    hole = mask | (distance_to(touching) < _GAP_EDGE if touching.any() else touching) & ~void
+    hole = mask.copy()
+    if touching.any():
+        # The floor is stained where it becomes thin, next to a gap. Of a narrow rim, the half at the edge remains.
+        width = np.minimum(_GAP_EDGE, distance_to(void)) if void.any() else _GAP_EDGE
+        hole = mask | (distance_to(touching) < width)
     parts, count = connected_parts(~hole)
     sizes = np.bincount(parts.ravel(), minlength=count + 1)
     islands = (sizes < _MAX_ISLAND_AREA * hole.sum()) & (np.arange(count + 1) > 0)
