@@ -226,20 +226,13 @@ class MotionSequence:
         return self.done[-1].motion.objectives(state, report, dt)
 
     def start_next(self, state: BodyState, report: StepReport | None) -> None:
-        """Start the next motion at ``state``; ``report`` is the report of the previous step. A motion whose target is
-        out of reach is replaced by a short stand, whose result is the missed target."""
-        from egs_warp.motions.stand import StandInstead
-
+        """Start the next motion at ``state``; ``report`` is the report of the previous step."""
         stance = self._stance.next_stance(state.positions, report) if self.done else self._stance
         if stance.base() is SupportKind.ROUND_BASE:
             self._stance = stance
         part = self._parts.pop(0)
         self._is_dropped = self._gets_up_next = False
-        try:
-            motion: BodyMotion = part.begin(stance)
-        except TargetError as error:
-            motion = StandInstead(stance, str(error))
-        self.done.append(MotionRecord(part.name, part.asked, motion, state.time))
+        self.done.append(MotionRecord(part.name, part.asked, part.begin(stance), state.time))
 
     def time_left(self, time: float, expected: Sequence[float]) -> float:
         """Estimate the time in seconds from ``time`` s until the body is at rest after the last motion; ``expected``

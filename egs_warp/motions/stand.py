@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from egs_warp.motions.joined_motion import JoinedMotion, MotionWorlds
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase
 from egs_warp.motions.moments import ReducedState
-from egs_warp.motions.sequence import JudgedOutcome, Stance
+from egs_warp.motions.sequence import BodyMotion, JudgedOutcome, MotionTask, Stance, TargetError
 from egs_warp.motions.stance import REST_SPEED, BalanceController, sole_shares, update_rest
 from egs_warp.motions.walk import Walk
 
@@ -258,3 +258,16 @@ class StandInstead(StandFor):
         """Return the missed target, and the displacements as ``StandFor`` measures them."""
         stood = super().outcome_record(trajectory, first, last)
         return InsteadOutcome((self._reason,), stood.sole_shift, stood.lean)
+
+
+def or_stand(task: MotionTask) -> MotionTask:
+    """Return ``task`` with a short stand in place of its motion if its target is out of reach where it starts; the
+    result of the stand is the missed target."""
+
+    def begin(stance: Stance) -> BodyMotion:
+        try:
+            return task.begin(stance)
+        except TargetError as error:
+            return StandInstead(stance, str(error))
+
+    return replace(task, begin=begin)
