@@ -48,7 +48,7 @@ def add_parser(commands: Commands) -> None:
     )
     film.add_argument("--motion", default="jump", help="motion of the film, as for animate (jump)")
     film.add_argument("--yes", action="store_true", help="take the object that is found; open no page to pick it")
-    film.add_argument("--iterations", type=int, help="optimiser steps of the training (cpu 2000, cuda 7000)")
+    film.add_argument("--iterations", type=int, help="optimiser steps of the training (cpu 1300, cuda 7000)")
     film.add_argument("--gaussians", type=int, help="maximum number of Gaussians (cpu 20000, cuda unlimited)")
     add_object_flags(film)
     film.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, such as --up=-y (default: estimated)")

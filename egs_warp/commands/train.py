@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _SHEET_PHOTOS = 6
 """Maximum number of photos in the comparison sheet."""
-_DEFAULTS = {"cpu": (2000, 20_000, 360), "cuda": (7000, None, 1600)}
+_DEFAULTS = {"cpu": (1300, 20_000, 360), "cuda": (7000, None, 1600)}
 """Iterations, maximum number of Gaussians, longer side of photos in pixels: preview on two cores, capture on a GPU."""
 
 
@@ -49,7 +49,7 @@ def add_parser(commands: Commands) -> None:
     train.add_argument(
         "--resume", action="store_true", help="continue an interrupted training; give the same flags again"
     )
-    train.add_argument("--iterations", type=int, help="optimiser steps, one photo each (cpu 2000, cuda 7000)")
+    train.add_argument("--iterations", type=int, help="optimiser steps, one photo each (cpu 1300, cuda 7000)")
     train.add_argument("--gaussians", type=int, help="maximum number of Gaussians (cpu 20000, cuda unlimited)")
     train.add_argument(
         "--max-side", type=int, help="longer side in pixels to which photos are reduced (cpu 360, cuda 1600)"

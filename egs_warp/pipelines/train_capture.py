@@ -16,7 +16,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import read_points
 from egs_warp.io.posed_images import ExcludedPhoto
 from egs_warp.render import render_gaussians
-from egs_warp.training.finetune import Densification, FinetuneOptions, finetune
+from egs_warp.training.finetune import Densification, FinetuneOptions, LearningRates, finetune
 from egs_warp.training.initial_cloud import MIN_POINTS, cloud_from_points, initial_cloud
 from egs_warp.training.metrics import match_tone, psnr, ssim_of
 from egs_warp.training.outlier_views import is_outlier
@@ -29,6 +29,9 @@ the literature."""
 _SH_STAGES = 10
 """Number of parts of the training: the SH degree is increased after each tenth of the iterations, up to the requested
 one."""
+_FULL_STEPS = 7000
+"""Number of iterations for which the learning rates are meant. A shorter training multiplies them by the square root of
+the ratio, because the distance that noisy steps of Adam cover grows with the rate and with the root of their number."""
 _FIRST_GAUSSIANS = 30_000
 """Initial number of Gaussians if there are no triangulated points and no maximum."""
 
@@ -158,6 +161,7 @@ def train(
     start = _start(posed, chosen, max_gaussians, sh_degree=sh_degree, seed=seed, device=device)
     options = FinetuneOptions(
         iterations=iterations,
+        rates=LearningRates().times(max(1.0, (_FULL_STEPS / iterations) ** 0.5)),
         background=None if cut_out else background,
         densification=Densification.RELOCATION,
         max_gaussians=max_gaussians,

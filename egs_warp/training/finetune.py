@@ -56,6 +56,10 @@ class LearningRates:
     sh_band_0: float = 2.5e-3
     sh_rest: float = 1.25e-4
 
+    def times(self, factor: float) -> LearningRates:
+        """Return all rates multiplied by ``factor``."""
+        return LearningRates(**{name: factor * rate for name, rate in vars(self).items()})
+
 
 @dataclass(frozen=True)
 class FinetuneOptions:

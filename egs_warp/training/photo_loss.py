@@ -6,6 +6,7 @@ The kernels are in ``egs_warp/kernels/training/photo_loss.py``.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -46,7 +47,7 @@ class PhotoLoss:
         line = torch.exp(-(torch.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
         self.window = (line / line.sum()).to(device)
         self._none = torch.zeros((1, 3), device=device)
-        self._scratch: dict[tuple[int, int], dict[str, torch.Tensor]] = {}
+        self._scratch: dict[tuple[int, int], _Scratch] = {}
 
     def __call__(
         self,
@@ -70,17 +71,21 @@ class PhotoLoss:
         """
         return _Loss.apply(colour, alpha, tone, target, backdrop, self)  # type: ignore[return-value]
 
-    def scratch(self, height: int, width: int) -> dict[str, torch.Tensor]:
-        """Return the buffers, by name, for images of ``height`` x ``width`` pixels."""
+    def scratch(self, height: int, width: int) -> _Scratch:
+        """Return the buffers for images of ``height`` x ``width`` pixels."""
         if (height, width) not in self._scratch:
             device = self.window.device
             pixels, padded = height * width, PADDING + (height + 2 * REACH) * self.pitch(width)
-            self._scratch[height, width] = {
+            tensors = {
                 # The kernels write no padding, so it remains zero.
                 **{name: torch.zeros(padded, device=device) for name in _PADDED},
                 **{name: torch.empty((pixels, 3), device=device) for name in ("front", "by_toned")},
                 "off": torch.empty(pixels, device=device),
             }
+            arrays = {
+                name: _array(tensor, wp.vec3 if tensor.ndim == 2 else wp.float32) for name, tensor in tensors.items()
+            }
+            self._scratch[height, width] = _Scratch(tensors, arrays)
         return self._scratch[height, width]
 
     @staticmethod
@@ -92,6 +97,26 @@ class PhotoLoss:
     def nothing(self) -> torch.Tensor:
         """Placeholder for an array that is absent."""
         return self._none
+
+
+@dataclass(frozen=True)
+class _Scratch:
+    """Buffers by name, as tensors and as Warp arrays of the same memory."""
+
+    tensors: dict[str, torch.Tensor]
+    arrays: dict[str, wp.array]
+
+
+def _array(tensor: torch.Tensor, dtype: Any) -> wp.array:
+    """View the contiguous ``tensor`` as a Warp array of one dimension, without a copy."""
+    device = wp.device_from_torch(tensor.device)
+    return _array_at(tensor.data_ptr(), dtype, tensor.numel() // (3 if dtype is wp.vec3 else 1), device.alias)
+
+
+@lru_cache(maxsize=1024)
+def _array_at(address: int, dtype: Any, count: int, device: str) -> wp.array:
+    """Return the array that starts at this address. It owns no memory, so it can be cached."""
+    return wp.array(ptr=address, dtype=dtype, shape=(count,), device=device)
 
 
 class _Loss(torch.autograd.Function):
@@ -109,24 +134,19 @@ class _Loss(torch.autograd.Function):
         pixels = height * width
         cut_out = int(target.alpha is not None)
         device = wp.device_from_torch(colour.device)
-        buffers = task.scratch(height, width)
+        scratch = task.scratch(height, width)
+        buffers, at = scratch.tensors, scratch.arrays
         tone = tone.detach().contiguous()
         by_colour = torch.empty((pixels, 3), device=colour.device)
         by_alpha = torch.empty(pixels if cut_out else 1, device=colour.device)
         behind = torch.tensor([backdrop], device=colour.device) if cut_out else task.nothing
 
         def of(value: torch.Tensor | None, dtype: Any = wp.vec3) -> wp.array:
-            tensor = task.nothing if value is None else value
-            count = tensor.numel() // (3 if dtype is wp.vec3 else 1)
-            return wp.array(ptr=tensor.data_ptr(), dtype=dtype, shape=(count,), device=device)
+            return _array(task.nothing if value is None else value, dtype)
 
-        at = {name: of(tensor, wp.vec3 if tensor.ndim == 2 else wp.float32) for name, tensor in buffers.items()}
         window, tones, backdrops = of(task.window, wp.float32), of(tone, wp.float32), of(behind)
-        weight = (
-            of(target.weight, wp.float32)
-            if target.weight is not None
-            else wp.array(ptr=task.nothing.data_ptr(), dtype=wp.float32, shape=(1,), device=device)
-        )
+        # The kernels recognise an absent weight by its length of 1.
+        weight = _array(task.nothing[0, :1] if target.weight is None else target.weight, wp.float32)
         colour, alpha = colour.detach().contiguous(), alpha.detach().contiguous()
         w, pitch = task.ssim_weight, task.pitch(width)
         kernels = (ssim_cpu if device.is_cpu else ssim_cuda).KERNELS
