@@ -231,11 +231,8 @@ def complete_help(parser: argparse.ArgumentParser) -> None:
 def _animate(args: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import check_run_folder
 
-    objects = named_objects(args.object)
-    if is_world(args.capture) or objects:
-        check_run_folder(args.out, overwrite=args.overwrite, writes=("sheet.png", "report.json"))
-        if not is_world(args.capture):
-            return EXIT_NOT_AS_REQUESTED if animate_scene_world(args, objects) else 0
+    if is_world(args.capture) or named_objects(args.object):
+        check_run_folder(args.out, overwrite=args.overwrite, writes=(NAME, "sheet.png", "report.json"))
         return run_animate(args)
     for flag in ("prop", "collision_mesh", "save_collision_mesh"):
         if getattr(args, flag) is not None:
@@ -251,6 +248,8 @@ def run_animate(args: argparse.Namespace) -> int:
     try:
         if is_world(args.capture):
             return EXIT_NOT_AS_REQUESTED if animate_world(args) else 0
+        if objects := named_objects(args.object):
+            return EXIT_NOT_AS_REQUESTED if animate_scene_world(args, objects) else 0
         report = _animate_scene(args) if args.object is not None else _animate_capture(args)
     except BaseException as error:
         # With --overwrite, the folder may still contain the earlier run, which must not be resumed as this run.

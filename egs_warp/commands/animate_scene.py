@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.animate_world import WORLD_FLAGS, check_flags, run_world
-from egs_warp.commands.flags import chosen_inpainter, parse_up
+from egs_warp.commands.flags import NAMED_VALUE, chosen_inpainter, parse_up
 from egs_warp.commands.segment import clearing_of
 from egs_warp.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
     from egs_warp.pipelines.scene_script import SceneProgress, SceneRequest
 
-_NAMED = re.compile(r"([A-Za-z0-9_-]+)=(.+)", re.DOTALL)
-"""Pattern of a value of ``--object`` with the name of the object."""
 _FLAGS = (
     *("object", "cameras", "view", "mask_model", "up", "flat", "straddling", "inpainter", "trust", "no_inpaint"),
     *("metres_per_unit", "friction", "motion", "prop", "collision_mesh", "save_collision_mesh"),
@@ -34,7 +31,7 @@ def named_objects(values: Sequence[str] | None) -> dict[str, tuple[str, ...]]:
     objects: dict[str, tuple[str, ...]] = {}
     unnamed = []
     for value in values or ():
-        match = None if Path(value).exists() else _NAMED.fullmatch(value)
+        match = None if Path(value).exists() else NAMED_VALUE.fullmatch(value)
         if match is None:
             unnamed.append(value)
         else:
@@ -55,7 +52,8 @@ def motions_of(text: str, names: Sequence[str], props: Sequence[str]) -> dict[st
         props: Names of the props.
 
     Raises:
-        UserError: A name is unknown or occurs twice, or names a prop, or a motion is invalid or empty.
+        UserError: A name is unknown or occurs twice, or names a prop, or a motion is invalid or empty, or is directed
+            towards a body that does not exist.
     """
     from egs_warp.motions.towards import check_motion
 
@@ -76,8 +74,8 @@ def motions_of(text: str, names: Sequence[str], props: Sequence[str]) -> dict[st
         if name in motions:
             raise UserError(f"--motion {part!r}: {name} has another motion, too; separate its motions by commas")
         motions[name] = motion
-    for motion in motions.values():
-        check_motion(motion)
+    for name, motion in motions.items():
+        check_motion(motion, [other for other in names if other != name])
     return motions
 
 
@@ -87,7 +85,7 @@ def animate_scene_world(args: argparse.Namespace, objects: Mapping[str, tuple[st
     from egs_warp.pipelines.scene_script import read_scene_parts
     from egs_warp.pipelines.world_file import WorldScript
 
-    check_flags(args, (*WORLD_FLAGS, *_FLAGS), "it has no effect on several objects of a scene; leave it out")
+    check_flags(args, (*WORLD_FLAGS, *_FLAGS, "config"), "it has no effect on several objects of a scene; leave it out")
     props = tuple(args.prop or ())
     for name in props:
         if name not in objects:

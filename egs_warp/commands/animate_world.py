@@ -83,12 +83,8 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
     view_from = None if args.view_from is None else parse_direction("view-from", args.view_from)
     ffmpeg_program()
     start_device(args.device)
-    # The flags of objects of a scene are not stored, so only the run of a world file can be resumed.
-    is_file = is_world(args.capture)
-    resume = is_file and args.resume
-    with run_folder(args.out, command=ANIMATE_WORLD, overwrite=args.overwrite, resume=resume) as folder:
-        if is_file:
-            folder.begin_with(lambda: write_config(folder.file(NAME), args, args.parser))
+    with run_folder(args.out, command=ANIMATE_WORLD, overwrite=args.overwrite, resume=args.resume) as folder:
+        folder.begin_with(lambda: write_config(folder.file(NAME), args, args.parser))
         # The parts of a scene are written at once, so that a later error does not lose minutes of work.
         progress = SceneProgress(
             print_note,
@@ -109,7 +105,7 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
                 style=style,
                 pushes=scripted.pushes,
                 get_up=not args.no_get_up,
-                parts=(lambda name: _folder_of(folder, name) / PARTS) if is_file else None,
+                parts=lambda name: _folder_of(folder, name) / PARTS,
                 resume=folder.path if folder.resumed else None,
                 progress=show_frames,
             )

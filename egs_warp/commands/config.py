@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from egs_warp.commands.camera_flags import TRANSPARENT
+from egs_warp.commands.flags import NAMED_VALUE
 from egs_warp.errors import UserError, did_you_mean
 
 NAME = "run.yaml"
@@ -19,9 +20,11 @@ NAME = "run.yaml"
 _CHECKSUM = "capture_sha256"
 _PATHS = (
     *("capture", "object", "plane", "cameras", "background", "terrain", "cage", "muscles"),
-    *("inpainter", "camera", "beats"),
+    *("inpainter", "camera", "beats", "mask_model", "collision_mesh"),
 )
 """Flags that may name files. In the YAML file, these paths are relative to its folder."""
+_WRITTEN = ("save_collision_mesh",)
+"""Flags that name files that the run writes, and that need not exist. Their paths are relative to the folder, too."""
 _WORDS = ("auto", "fixed", "follow", "orbit", "patch", "telea", "ns", TRANSPARENT)
 """Values of these flags that do not name files."""
 _IN_MOTION = re.compile(r"\S+\.(?:json|csv)", re.IGNORECASE)
@@ -142,6 +145,11 @@ def _from_file(name: str, value: str, folder: Path) -> str:
     """Return a value of the YAML file in ``folder``: a path relative to the working folder, other values unchanged."""
     if name == "motion":
         return _IN_MOTION.sub(lambda match: str(folder / match[0]), value)
+    if name in _WRITTEN:
+        return str(folder / value)
+    if name == "object":
+        before, file, after = _parts_of_object(value, folder)
+        return f"{before}{folder / file}{after}" if os.path.lexists(folder / file) else value
     is_file = name in _PATHS and value not in _WORDS and os.path.lexists(folder / value)
     return str(folder / value) if is_file else value
 
@@ -154,7 +162,23 @@ def _for_file(name: str, value: str, folder: Path) -> str:
 
     if name == "motion":
         return _IN_MOTION.sub(lambda match: relative(match[0]), value)
+    if name in _WRITTEN:
+        return os.path.relpath(value, folder)
+    if name == "object":
+        before, file, after = _parts_of_object(value, Path())
+        return f"{before}{relative(file)}{after}"
     return relative(value) if name in _PATHS and value not in _WORDS else value
+
+
+def _parts_of_object(value: str, folder: Path) -> tuple[str, str, str]:
+    """Split a value of ``--object`` into the name of the object with its equals sign, the name of a file in ``folder``,
+    and the name of a record in the file; the first and the last may be empty."""
+    if os.path.lexists(folder / value):
+        return "", value, ""
+    named = NAMED_VALUE.fullmatch(value)
+    before, rest = (f"{named[1]}=", named[2]) if named else ("", value)
+    file, colon, record = rest.partition(".json:")
+    return (before, f"{file}.json", f":{record}") if colon else (before, rest, "")
 
 
 def _checksum(path: Path) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -25,6 +26,8 @@ QP_SOLVERS = ("osqp", "admm", "daqp")
 """Values of ``egs_warp.locomotion.solvers.QpSolver``, repeated here because that module is slow to import."""
 STRATEGIES = ("modes", "paper")
 """Values of ``egs_warp.locomotion.strategies.Strategy``, repeated here because that module is slow to import."""
+NAMED_VALUE = re.compile(r"([A-Za-z0-9_-]+)=(.+)", re.DOTALL)
+"""Pattern of a value of ``--object`` with the name of the object."""
 _FLAGS = {"cage_file": "--cage", "muscles_file": "--muscles", "solids": "--terrain"}
 """Map from library arguments to flags, for flags with another name."""
 

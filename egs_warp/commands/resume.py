@@ -39,10 +39,7 @@ def _resume(args: argparse.Namespace) -> int:
         return status
     config = folder / NAME
     if not config.is_file():
-        raise UserError(
-            f"{config}: is missing; the run was interrupted before its first step, or it has several objects of a"
-            " scene, whose flags are not stored; start it again"
-        )
+        raise UserError(f"{config}: is missing; the run was interrupted before its first step; start it again")
     arguments = [f"--config={config}", f"--out={folder}", *(["--trust"] if args.trust else [])]
     run = args.animate.parse_args(with_config(arguments, args.animate))
     run.resume = True

@@ -19,7 +19,7 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.bitmaps import connected_parts, depth_inside, distance_to
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, concatenate
 from egs_warp.inpainting.holes import Hole
-from egs_warp.inpainting.inpainters import Inpainter
+from egs_warp.inpainting.inpainters import Inpainter, OpenCvInpainter
 from egs_warp.inpainting.new_floor import flat_gaussians, rim_heights, with_gloss
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis, painting_time
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, diffuse_only, rectify
@@ -55,6 +55,9 @@ _GAP_EDGE = 6.0
 """Width, in texels, of the unreliable floor around a gap; it is filled with the gap."""
 _CHANNEL = 9.0
 """Half width, in texels. A channel narrower than this does not connect a gap to the empty space beyond the floor."""
+_EDGE_BAND = 0.1
+"""Distance from the edge of the floor within which Gaussians below the floor belong to its side, as a fraction of the
+hole's side."""
 _MIN_RIM_FRACTION = 0.4
 """Minimum fraction of the hole's edge that must be floor."""
 _MAX_ISLAND_AREA = 0.15
@@ -133,7 +136,8 @@ def inpaint(
     Args:
         background: the capture without the object.
         hole: region of the floor to fill.
-        inpainter: fills the face-on picture; ``PatchSynthesis`` by default.
+        inpainter: fills the face-on picture; by default ``PatchSynthesis``, or ``OpenCvInpainter`` if too little floor
+            is left to copy from.
         options: see ``InpaintOptions``.
         progress: called with the approximate share of the time that has passed, 0 to 1.
 
@@ -141,22 +145,24 @@ def inpaint(
         UserError: the hole is off the floor, too narrow, or leaves no floor to copy from.
     """
     options = options or InpaintOptions()
-    inpainter = inpainter or PatchSynthesis(seed=options.seed, device=str(background.device))
+    synthesis = PatchSynthesis(seed=options.seed, device=str(background.device))
     clock = _Clock()
     window, grown, spacing = _window_around(background, hole, options.margin)
-    thickness = _THICKNESS * hole.bounds()[1]
-    junk = _in_hole(background, window, grown, hole.bounds()[1])
+    side = hole.bounds()[1]
+    thickness = _THICKNESS * side
+    junk = _in_hole(background, window, grown, side)
     if junk.all():
         raise UserError("inpaint: the hole covers the whole capture; make it smaller")
     retained = background.subset(~junk)
     before = rectify(retained, window, thickness=thickness)
-    grown, known = _closed(grown, before.alpha)
+    grown, known, void = _closed(grown, before.alpha)
     _check(grown, known)
-    # The gaps that were added to the hole contain haze, too.
-    junk = _in_hole(background, window, grown, hole.bounds()[1])
+    # The gaps that were added to the hole contain haze, too. What lies below the floor at its edge is its side, for
+    # example that of a table or of a pedestal.
+    inner = grown & (distance_to(void) > _EDGE_BAND * _TEXELS_ACROSS) if void.any() else grown
+    junk = _in_hole(background, window, inner, side)
     grown, known, stained = _without_stain(grown, known, before)
-    # Stains lie on the floor; Gaussians far below it belong to a table's side.
-    junk |= _in_hole(background, window, grown, hole.bounds()[1], depth=_THICKNESS)
+    junk |= _in_hole(background, window, grown, side, depth=_THICKNESS)
     if junk.all():
         raise UserError("inpaint: the hole covers the whole capture; make it smaller")
     retained = background.subset(~junk)
@@ -171,9 +177,16 @@ def inpaint(
     show_painting(0.0)
     # Where there is no stain, there is no shadow either, and dark floor keeps its colour.
     shade = shaded(grown, known, before.colour) if stained else None
-    painted = inpainter.fill(
-        np.where(known[..., None], before.colour, 0.0), grown, known, shade, progress=show_painting
-    )
+    image = np.where(known[..., None], before.colour, 0.0)
+    notes: tuple[str, ...] = ()
+    try:
+        painted = (inpainter or synthesis).fill(image, grown, known, shade, progress=show_painting)
+    except UserError as error:
+        if inpainter is not None:
+            raise
+        # The rim of the floor is narrower than a patch.
+        painted = OpenCvInpainter().fill(image, grown, known)
+        notes = (f"the colours around the hole were continued smoothly ({error})",)
     clock.lap("inpaint")
     new = flat_gaussians(
         window,
@@ -207,7 +220,7 @@ def inpaint(
     new = with_gloss(new, retained.subset(floor), window)
     cloud = concatenate(retained, new)
     clock.lap("join")
-    notes = (
+    notes += (
         f"{int(junk.sum())} Gaussians in the hole were replaced by {new.count} on the plane",
         f"the hole is {grown.sum() * window.texel**2:.3g} square scene units; a texel is {window.texel:.3g} wide",
         *((f"{100 * stained:.0f} % of the hole was floor stained by the object's shadow or foot",) if stained else ()),
@@ -270,22 +283,26 @@ def _in_hole(
     return window.sample(mask, means) & (heights > -depth * side) & (heights < _HAZE * side)
 
 
-def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the hole enlarged by adjacent gaps and by islands of floor inside it, and the known floor; both (rows,
-    columns) bool."""
+def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the hole enlarged by adjacent gaps and by islands of floor inside it, the known floor, and the empty space
+    beyond the edge of the floor; all (rows, columns) bool."""
     # Pinholes between splats are not gaps.
     closed: Any = ndimage.binary_closing(np.pad(alpha > _KNOWN, 4, mode="edge"), iterations=2)
     solid = np.asarray(closed[4:-4, 4:-4])
     near = distance_to(mask) < _GAP_REACH * _TEXELS_ACROSS
-    gaps, _ = connected_parts(mask | (~solid & near & ~_void(~solid & ~mask)))
+    void = _void(~solid & ~mask)
+    gaps, _ = connected_parts(mask | (~solid & near & ~void))
     touching = np.isin(gaps, np.unique(gaps[mask])) & ~mask
-    # The floor is stained where it becomes thin, next to a gap.
-    hole = mask | (distance_to(touching) < _GAP_EDGE if touching.any() else touching)
+    hole = mask.copy()
+    if touching.any():
+        # The floor is stained where it becomes thin, next to a gap. Of a narrow rim, the half at the edge remains.
+        width = np.minimum(_GAP_EDGE, distance_to(void)) if void.any() else _GAP_EDGE
+        hole = mask | (distance_to(touching) < width)
     parts, count = connected_parts(~hole)
     sizes = np.bincount(parts.ravel(), minlength=count + 1)
     islands = (sizes < _MAX_ISLAND_AREA * hole.sum()) & (np.arange(count + 1) > 0)
     hole |= islands[parts]
-    return hole, solid & ~hole
+    return hole, solid & ~hole, void
 
 
 def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) -> tuple[np.ndarray, np.ndarray, float]:
@@ -297,7 +314,7 @@ def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) 
     stain = stain_around(hole, known, before.colour)
     if not stain.any():
         return hole, known, 0.0
-    whole, left = _closed(hole | stain, before.alpha)
+    whole, left, _ = _closed(hole | stain, before.alpha)
     try:
         _check(whole, left)
     except UserError:

@@ -16,6 +16,7 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
+from egs_warp.motions.landing import check_landing
 from egs_warp.motions.sequence import MotionTask, Stance
 from egs_warp.motions.stance import sole_shares
 
@@ -38,11 +39,15 @@ class Hop:
             stance: stance at the start.
             square: (3,) m, target position of the middle of the feet.
             height: rise of the centre of mass, m.
+
+        Raises:
+            TargetError: the ground ends where the body would land.
         """
         offset = square - sole_shares(stance.body, stance.ground, stance.standing) @ stance.standing
         stance = stance.with_forward(offset)
         forward, _, rise = stance.ground.axes @ offset
         target = JumpTarget(float(forward), height + max(float(rise), 0.0), float(rise))
+        check_landing(stance, target)
         self.jump, self.square = Jump(stance, target), square
         self._feet = sole_shares(stance.body, stance.ground, stance.standing)
 

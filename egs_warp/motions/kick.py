@@ -13,6 +13,7 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
+from egs_warp.motions.landing import landing_of
 from egs_warp.motions.other_body import OtherBody
 from egs_warp.motions.sequence import JudgedOutcome, Stance, TargetError
 
@@ -48,7 +49,7 @@ class Kick:
             target: distance and height of the jump, m.
 
         Raises:
-            TargetError: if the other body is out of reach of the jump.
+            TargetError: if the other body is out of reach of the jump, or the ground ends where it lands.
         """
         self.body, self._other, self._name = stance.body, other, name
         ground = stance.ground
@@ -68,7 +69,8 @@ class Kick:
         # The path passes to the right of the body.
         angle = float(np.arctan2(centre[1], centre[0])) - float(np.arcsin(offset / distance))
         forward = np.array([np.cos(angle), np.sin(angle)]) @ ground.axes[:2]
-        self.jump = Jump(stance.with_forward(forward), target)
+        turned = stance.with_forward(forward)
+        self.jump = Jump(turned, landing_of(turned, target))
         self._before = other.state().positions
         self._after = self._before
         self._tilt = 0.0

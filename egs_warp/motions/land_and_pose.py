@@ -13,6 +13,7 @@ from egs_warp.motions.act import Act, ActOutcome
 from egs_warp.motions.gestures import landed_pose
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
+from egs_warp.motions.landing import landing_of
 from egs_warp.motions.sequence import Stance
 
 _DEPTH = 0.15
@@ -29,7 +30,7 @@ class LandAndPose:
             UserError: for a body that lies along the ground or rolls.
         """
         self._stance, self._seconds = stance, seconds
-        self.jump = Jump(stance, stance.landing(target))
+        self.jump = Jump(stance, landing_of(stance, target))
         self._depth = _DEPTH * self.jump.landing_height
         self.jump.landing_height -= self._depth
         self._pose: Act | None = None

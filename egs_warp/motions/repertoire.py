@@ -22,6 +22,7 @@ from egs_warp.motions.hop import HopTargets
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.keyframes import Key, read_keyframes
+from egs_warp.motions.landing import landing_of
 from egs_warp.motions.request import MAX_TARGET, MAX_TURN, MotionRequest
 from egs_warp.motions.retake import Retake
 from egs_warp.motions.route import Route, path_route, read_path, straight_route
@@ -89,7 +90,7 @@ def _repeat_task(
 
 def _jump_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     target = _target(request.asked, height)
-    return _repeat_task(request, request.asked, lambda stance: Jump(stance, stance.landing(target)))
+    return _repeat_task(request, request.asked, lambda stance: Jump(stance, landing_of(stance, target)))
 
 
 def _hop_tasks(request: MotionRequest, height: float) -> list[MotionTask]:

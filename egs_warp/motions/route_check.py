@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from egs_warp.errors import UserError
-from egs_warp.motions.sequence import Stance
+from egs_warp.motions.sequence import Stance, TargetError
 
 MAX_STEP_HEIGHT = 0.03
 """Largest height of an obstacle above the ground, and depth of a hollow below it, in body heights."""
@@ -19,7 +18,7 @@ def check_route(stance: Stance, planar_poses: np.ndarray) -> None:
         planar_poses: (n, 3) planar poses of the route, see ``motions.route``.
 
     Raises:
-        UserError: at the first step that is higher or deeper than ``MAX_STEP_HEIGHT``.
+        TargetError: at the first step that is higher or deeper than ``MAX_STEP_HEIGHT``.
     """
     body, ground = stance.body, stance.ground
     start = ground.local(body.centre_of_mass(stance.standing))
@@ -32,4 +31,4 @@ def check_route(stance: Stance, planar_poses: np.ndarray) -> None:
         if abs(rise) > MAX_STEP_HEIGHT:
             where = f"{x / body.height:.2f} ahead and {y / body.height:.2f} to the left"
             obstacle = f"the surface there is {abs(rise):.2f} body heights {'higher' if rise > 0.0 else 'lower'}"
-            raise UserError(f"walk: the path leads over a step, {where}: {obstacle}; walk around it, or jump or hop")
+            raise TargetError(f"walk: the path leads over a step, {where}: {obstacle}; walk around it, or jump or hop")

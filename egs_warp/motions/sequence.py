@@ -17,7 +17,6 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import Foot, SupportKind, find_feet, support_kind_of
-from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.limbs import Limbs
 from egs_warp.motions.stance import GroundFrame, heading_between, sole_shares
 from egs_warp.motions.style import Style
@@ -112,17 +111,6 @@ class Stance:
         it; 0 without a surface."""
         rise = surface_above(self.solids, point, self.ground.axes[2])
         return rise if np.isfinite(rise) else 0.0
-
-    def landing(self, target: JumpTarget) -> JumpTarget:
-        """Return ``target`` with the rise of the surface on which the feet will land. The jump clears the surface by at
-        least half of the requested height. The target is unchanged without a surface, or if the surface is higher than
-        the jump, such as a wall or a lintel."""
-        feet, up = sole_shares(self.body, self.ground, self.standing) @ self.standing, self.ground.axes[2]
-        ahead = surface_above(self.solids, feet + target.distance * self.ground.axes[0], up)
-        rise = ahead - surface_above(self.solids, feet, up)
-        if not np.isfinite(rise) or rise > target.height:
-            return target
-        return replace(target, rise=rise, height=max(target.height, rise + 0.5 * target.height))
 
     def with_forward(self, direction: np.ndarray) -> Stance:
         """Return the same stance with another forward ``direction`` (3,); the body is not rotated."""

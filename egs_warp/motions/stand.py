@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,12 +18,14 @@ from egs_warp.motions.joined_motion import JoinedMotion, MotionWorlds
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase
 from egs_warp.motions.moments import ReducedState
-from egs_warp.motions.sequence import Stance
+from egs_warp.motions.sequence import BodyMotion, JudgedOutcome, MotionTask, Stance, TargetError
 from egs_warp.motions.stance import REST_SPEED, BalanceController, sole_shares, update_rest
 from egs_warp.motions.walk import Walk
 
 MAX_CAPTURE_STEPS = 3
 """Maximum number of capture steps of one stand."""
+_INSTEAD_TIME = 0.1
+"""Duration of a stand in place of another motion, s."""
 _RATE = 4.0
 """Rate in sqrt(g / H) at which the centre of mass returns over the feet."""
 
@@ -57,6 +59,11 @@ class StandOutcome:
     """Largest displacement of the middle of a sole along the ground."""
     lean: float
     """Largest displacement of the centre of mass along the ground."""
+
+
+@dataclass(frozen=True)
+class InsteadOutcome(StandOutcome, JudgedOutcome):
+    """Measured result of a stand in place of a motion whose target was out of reach."""
 
 
 @dataclass(frozen=True)
@@ -237,3 +244,30 @@ class StandFor:
                 self._step, self.step_count = step, self.step_count + 1
         moving = self._stand if self._step is None else self._step
         return list(moving.objectives(state, report, dt))
+
+
+class StandInstead(StandFor):
+    """Short stand in place of a motion whose target is out of reach where the motion starts."""
+
+    def __init__(self, stance: Stance, reason: str) -> None:
+        """Create the stand; ``reason`` describes the target for the report."""
+        super().__init__(stance, _INSTEAD_TIME)
+        self._reason = reason
+
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> InsteadOutcome:
+        """Return the missed target, and the displacements as ``StandFor`` measures them."""
+        stood = super().outcome_record(trajectory, first, last)
+        return InsteadOutcome((self._reason,), stood.sole_shift, stood.lean)
+
+
+def or_stand(task: MotionTask) -> MotionTask:
+    """Return ``task`` with a short stand in place of its motion if its target is out of reach where it starts; the
+    result of the stand is the missed target."""
+
+    def begin(stance: Stance) -> BodyMotion:
+        try:
+            return task.begin(stance)
+        except TargetError as error:
+            return StandInstead(stance, str(error))
+
+    return replace(task, begin=begin)

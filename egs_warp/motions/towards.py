@@ -7,7 +7,7 @@ steered while they run: they follow a body that moves, and avoid other bodies an
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -92,9 +92,7 @@ def script_among(text: str, others: Mapping[str, OtherBody], stance: Stance) -> 
         if piece is None:
             requests += _among(script(text_of_piece).requests, others, stance)
             continue
-        if piece.name not in others:
-            known = f"give one of {', '.join(others)}" if others else "the world has no other body"
-            raise UserError(f"{where}: no body {piece.name!r}{did_you_mean(piece.name, others)}; {known}")
+        _check_name(piece, others, where)
         asked: dict[str, float] = {}
         seconds = _time_limit(piece, others[piece.name], stance)
         begin = partial(_begin, piece, others, asked)
@@ -102,11 +100,22 @@ def script_among(text: str, others: Mapping[str, OtherBody], stance: Stance) -> 
     return Script(tuple(requests))
 
 
-def check_motion(text: str) -> None:
-    """Raise ``UserError`` for a mistake in motions that does not depend on the names of other bodies."""
-    for number, piece in enumerate(_pieces(text), start=1):
-        if _parse(piece, f"motion {number} ({piece!r})") is None:
-            script(piece).frames()
+def check_motion(text: str, others: Collection[str]) -> None:
+    """Raise ``UserError`` for a mistake in motions of a creature among bodies with the names ``others``."""
+    for number, text_of_piece in enumerate(_pieces(text), start=1):
+        where = f"motion {number} ({text_of_piece!r})"
+        piece = _parse(text_of_piece, where)
+        if piece is None:
+            script(text_of_piece).frames()
+        else:
+            _check_name(piece, others, where)
+
+
+def _check_name(piece: _Piece, others: Collection[str], where: str) -> None:
+    """Raise ``UserError`` if the body of a motion is not among ``others``."""
+    if piece.name not in others:
+        known = f"give one of {', '.join(others)}" if others else "the world has no other body"
+        raise UserError(f"{where}: no body {piece.name!r}{did_you_mean(piece.name, others)}; {known}")
 
 
 def _pieces(text: str) -> list[str]:

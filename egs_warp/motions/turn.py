@@ -12,6 +12,7 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpPlan, JumpTarget
+from egs_warp.motions.landing import landing_of
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.twist import AIRBORNE_FRACTION
 
@@ -45,7 +46,7 @@ class Turn:
         self._remaining_turn = turn
         self._remaining_after_jump: float | None = None
         """Predicted or measured remaining turn after the current jump, in radians; None before it is in the air."""
-        first = Jump(stance, stance.landing(target), turn=turn)
+        first = Jump(stance, landing_of(stance, target), turn=turn)
         self.max_turn_per_jump = MAX_TURN_FRACTION * largest_turn(first, stance)
         self._one_jump = abs(turn) <= self.max_turn_per_jump
         self.jumps = [first if self._one_jump else self._twist(stance, target)]
@@ -124,7 +125,7 @@ class Turn:
         return self._remaining_turn / float(np.ceil(abs(self._remaining_turn) / self.max_turn_per_jump))
 
     def _twist(self, stance: Stance, target: JumpTarget) -> Jump:
-        return Jump(stance, stance.landing(target), turn=self._next_turn())
+        return Jump(stance, landing_of(stance, target), turn=self._next_turn())
 
     def _next_jump(self, state: BodyState) -> Jump:
         stance = self._stance.moved_to(state.positions)

@@ -27,6 +27,7 @@ from egs_warp.motions.push import Push, PushKicks
 from egs_warp.motions.script import Script
 from egs_warp.motions.script import motion as script
 from egs_warp.motions.sequence import MotionRecord, MotionSequence, Stance
+from egs_warp.motions.stand import or_stand
 from egs_warp.motions.style import Style
 from egs_warp.pipelines.captured_body import CapturedBody
 from egs_warp.pipelines.creature import Creature, initial_stance
@@ -246,7 +247,7 @@ class Performer:
         self.creature, self.pushes = creature, tuple(pushes)
         self.place = initial_stance(creature, step=step, style=style)
         expected = motion.check(self.place)
-        self.sequence = MotionSequence(self.place, motion.parts(creature.body.height))
+        self.sequence = MotionSequence(self.place, [or_stand(part) for part in motion.parts(creature.body.height)])
         self.watch = FallMonitor(self.sequence, self.place, gets_up=get_up)
         self.kicks = PushKicks(self.place, self.pushes)
         # If a step is longer than 1/60 s, a frame has one step.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,20 +88,21 @@ def read_world_file(path: Path, progress: SceneProgress, *, device: str | None =
         if key in tree and "scene" not in tree:
             line = line_of(node, [key])
             raise UserError(f"{path}, line {line}: {key} is for a scene; add scene: capture, or leave it out")
-    names = _object_names(path, entries, node)
+    names = _names(path, entries, node)
     for index, entry in enumerate(entries):
         # Check motions and pushes before any body is created, which takes longer.
         with _at_line(path, node, index):
             if "motion" in entry:
-                check_motion(entry["motion"])
+                check_motion(entry["motion"], [name for other, name in names.items() if other != index])
             if "push" in entry:
                 read_pushes(entry["push"])
     solids = tuple(_solid(each) for each in tree.get("obstacles", ()))
     parts = None
     notes: list[str] = []
     if "scene" in tree:
-        where = {name: f"{path}, line {line_of(node, ['bodies', index])}" for index, name in names.items()}
-        request = _scene_request(path.parent, tree, {name: entries[index] for index, name in names.items()})
+        objects = {name: index for index, name in names.items() if "object" in entries[index]}
+        where = {name: f"{path}, line {line_of(node, ['bodies', index])}" for name, index in objects.items()}
+        request = _scene_request(path.parent, tree, {name: entries[index] for name, index in objects.items()})
         try:
             parts = read_scene_parts(request, device=device, solids=solids, progress=progress)
         except UserError as error:
@@ -116,11 +117,10 @@ def read_world_file(path: Path, progress: SceneProgress, *, device: str | None =
     motions: dict[str, str] = {}
     pushes: dict[str, tuple[Push, ...]] = {}
     for index, entry in enumerate(entries):
-        if index in names:
-            name = names[index]
-        else:
+        name = names[index]
+        if "object" not in entry:
             with _at_line(path, node, index):
-                name = _add_body(world, path.parent, entry, bodies, notes, device, progress.show_stage)
+                _add_body(world, name, path.parent, entry, bodies, notes, device, progress.show_stage)
         if "motion" in entry:
             motions[name] = entry["motion"]
         if "push" in entry:
@@ -139,42 +139,45 @@ def _at_line(path: Path, node: Any, index: int) -> Iterator[None]:
 
 def _add_body(
     world: World,
+    name: str,
     folder: Path,
     entry: Mapping[str, Any],
     bodies: dict[str, Creature | Prop],
     notes: list[str],
     device: str | None,
     show_stage: Callable[[str], object],
-) -> str:
-    """Add the body of an entry with a capture to ``world`` and return its name. ``bodies`` contains the bodies made so
-    far, which copies share; notes on a new body are added to ``notes``."""
+) -> None:
+    """Add the body ``name`` of an entry with a capture to ``world``. ``bodies`` contains the bodies made so far, which
+    copies share; notes on a new body are added to ``notes``."""
     key = repr([entry.get(name) for name in _MAKER_KEYS])
-    name = entry.get("name", Path(entry["capture"]).stem)
     if key not in bodies:
         show_stage(f"preparing {name}")
         bodies[key] = _make_body(folder, entry, device)
         notes += [f"{name}: {note}" for note in bodies[key].notes]
-    name = _unused_name(world, name) if "name" not in entry else name
-    return world.add(
+    world.add(
         bodies[key],
         at=tuple(entry.get("at", (0.0, 0.0))),
         above=entry.get("above", 0.0),
         heading=entry.get("heading"),
         name=name,
         path=_path(entry) if "path" in entry else None,
-    ).name
+    )
 
 
-def _object_names(path: Path, entries: Sequence[Mapping[str, Any]], node: Any) -> dict[int, str]:
-    """Return the names of the bodies that are objects of the scene, by their indices."""
+def _names(path: Path, entries: Sequence[Mapping[str, Any]], node: Any) -> dict[int, str]:
+    """Return the names of the bodies by their indices in the file; first the objects of the scene, which are added to
+    the world first."""
     names: dict[int, str] = {}
-    for index, entry in enumerate(entries):
-        if "object" in entry:
+    for index in sorted(range(len(entries)), key=lambda index: "object" not in entries[index]):
+        entry = entries[index]
+        if "name" in entry or "object" in entry:
             name = entry.get("name", f"object-{index + 1}")
             if name in names.values():
                 line = line_of(node, ["bodies", index])
                 raise UserError(f"{path}, line {line}: another body has the name {name!r}; choose another one")
-            names[index] = name
+        else:
+            name = _unused_name(names.values(), Path(entry["capture"]).stem)
+        names[index] = name
     return names
 
 
@@ -317,11 +320,10 @@ def _path(entry: Mapping[str, Any]) -> RigidPath:
     return RigidPath(times, shifts, turns, repeat=entry.get("repeat", False))
 
 
-def _unused_name(world: World, name: str) -> str:
+def _unused_name(used: Collection[str], name: str) -> str:
     """Return ``name`` with ``-`` for characters that names cannot have, and with a number if it is already taken."""
     base = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in name)
-    names = {placed.name for placed in world.members}
     number = 1
-    while (candidate := base if number == 1 else f"{base}-{number}") in names:
+    while (candidate := base if number == 1 else f"{base}-{number}") in used:
         number += 1
     return candidate

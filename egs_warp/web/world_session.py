@@ -70,6 +70,8 @@ class SteeredBody:
     steering: MotionScheduler | None = None
     """Queue of motions; None for a prop."""
     forces: UserForces = field(default_factory=UserForces)
+    puller: WorldPage | None = None
+    """Page that pulls the body; None if none does."""
     stillness: StillnessDetector = field(default_factory=StillnessDetector)
 
     @property
@@ -87,6 +89,12 @@ class SteeredBody:
             return ()
         report = None if self.report is None else support_report(self.member.body.stepper, self.report)
         return self.steering.objectives(self.state, report, dt)
+
+    def release(self, page: WorldPage) -> None:
+        """End the pull of ``page``, if it pulls the body."""
+        if self.puller is page:
+            self.forces.release()
+            self.puller = None
 
     def pushed(self, dt: float) -> BodyState:
         """Return the state after the pull and the pushes of the user."""
@@ -172,12 +180,12 @@ class WorldSession:
         """Remove a page and end its pull."""
         with self.changed:
             self.pages.remove(page)
-            self.bodies[page.selected].forces.release()
+            self.bodies[page.selected].release(page)
 
     def select(self, page: WorldPage, index: int) -> None:
         """Let a page steer the body ``index``."""
         with self.changed:
-            self.bodies[page.selected].forces.release()
+            self.bodies[page.selected].release(page)
             page.selected = index
             others = [other for other in self.pages if other is not page and other.selected == index]
             self.changed.notify_all()
@@ -274,7 +282,7 @@ class WorldSession:
             case Pull(node, target):
                 self._pull(page, node, target)
             case Release():
-                body.forces.release()
+                body.release(page)
             case PushOnce():
                 body.forces.push(message)
             case Restyle(style):
@@ -301,6 +309,7 @@ class WorldSession:
         body = self.bodies[page.selected]
         if first <= node < first + len(self.page_bodies[page.selected].cage.nodes):
             body.forces.pull(body.member.body.body, Pull(node - first, target))
+            body.puller = page
 
     def _reset(self) -> None:
         """Put all bodies back to their start; those that follow a path stay on it."""

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import warp as wp
 
 from egs_warp import cli
 from egs_warp.assets import pawn
 from egs_warp.commands.animate_scene import motions_of, named_objects
 from egs_warp.contact.terrain import surface_above
 from egs_warp.errors import UserError
-from egs_warp.geometry.gaussians import concatenate, with_degree
 from egs_warp.io import write_ply
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.scene_collision import read_collision_mesh
-from tests.support.scenes import blocks
+from tests.support.scenes import two_pawns_on_a_board
 
 
 def test_objects_have_names_or_none_has(tmp_path: Path) -> None:
@@ -46,6 +43,8 @@ def test_motions_are_given_by_name_or_to_all_creatures() -> None:
         ("box: jump", "box is a prop, which has no muscles; leave --prop box out"),
         ("a: jump; a: walk 1", "a has another motion, too"),
         ("a: fly", "fly"),
+        ("a: nod, kick c", r"motion 2 \('kick c'\): no body 'c'.*; give one of b, box"),
+        ("a: jump to a", "no body 'a'"),
         ("", "name a motion"),
     ):
         with pytest.raises(UserError, match=message):
@@ -78,10 +77,7 @@ def test_mistakes_are_refused_in_one_line(
 def test_two_objects_of_a_scene_become_bodies_of_one_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two pawns 1.5 apart on a board: their places in the world are their places in the capture, the board ends at its
     edge, and the collision mesh has the block beside them at its place in the capture."""
-    thing = pawn(gaussian_count=3000, device="cpu").cloud
-    shifted = replace(thing, means=wp.array(thing.means.numpy() + np.array([1.5, 0.0, 0.0], np.float32), dtype=wp.vec3))
-    board = blocks(((-1.5, -1.5, -0.04), (3.0, 1.5, 0.0)), ((0.6, 0.9, 0.0), (1.0, 1.3, 0.5)))
-    write_ply(tmp_path / "room.ply", concatenate(*(with_degree(each, 0) for each in (thing, shifted, board))))
+    write_ply(tmp_path / "room.ply", two_pawns_on_a_board())
     out, mesh = tmp_path / "out", tmp_path / "mesh.glb"
     selected = [
         "--object",
@@ -101,7 +97,7 @@ def test_two_objects_of_a_scene_become_bodies_of_one_world(tmp_path: Path, capsy
     files = json.loads((out / "manifest.json").read_text())["files"]
     assert {"world.mp4", "obstacles.png", "background.ply", "near/object.ply", "far/segment.png"} <= files.keys()
     near, far = (Trajectory.load(out / name / "trajectory.npz").positions[0].mean(axis=0) for name in ("near", "far"))
-    height = 1.0 / thing.means.numpy()[:, 2].max()
+    height = 1.0 / pawn(gaussian_count=3000, device="cpu").cloud.means.numpy()[:, 2].max()
     np.testing.assert_allclose(far[:2] - near[:2], [1.5 * height, 0.0], atol=0.05)
     assert Trajectory.load(out / "far" / "trajectory.npz").ground_coefficients.min() < -1.0
     solids = read_collision_mesh(mesh)

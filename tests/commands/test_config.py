@@ -118,6 +118,28 @@ def test_clicks_are_a_list_and_clicks_of_the_command_line_replace_those_of_the_f
         _given(["--config", str(tmp_path / "run.yaml")])
 
 
+def test_files_of_named_objects_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Values with the name of an object or of a record keep it; a file that the run writes need not exist."""
+    parser, commands = cli._parsers()
+    for name in ("a=odd.png", "mask.png", "picked.json", "m.glb"):
+        (tmp_path / name).write_text("")
+    monkeypatch.chdir(tmp_path)
+    values = ["b=mask.png", "c=picked.json:fox", "d=0,0,1", "e=+1,2@x=1.jpg"]
+    flags = [f"--object={value}" for value in values]
+    flags += ["--collision-mesh", "m.glb", "--save-collision-mesh", "new.glb"]
+    chosen = parser.parse_args(["animate", "a.ply", *flags, "--out", "x"])
+    (tmp_path / "x").mkdir()
+    write_config(tmp_path / "x" / "run.yaml", chosen, commands["animate"])
+    monkeypatch.chdir(tmp_path / "x")
+    given = _given(["--config", "run.yaml"])
+    assert given["object"] == ["b=../mask.png", "c=../picked.json:fox", "d=0,0,1", "e=+1,2@x=1.jpg"]
+    assert (given["collision_mesh"], given["save_collision_mesh"]) == (Path("../m.glb"), Path("../new.glb"))
+    monkeypatch.chdir(tmp_path)
+    odd = parser.parse_args(["animate", "a.ply", "--object", "a=odd.png", "--out", "x"])
+    write_config(tmp_path / "x" / "run.yaml", odd, commands["animate"])
+    assert _given(["--config", "x/run.yaml"])["object"] == ["x/../a=odd.png"]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

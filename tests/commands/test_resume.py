@@ -21,8 +21,9 @@ from egs_warp.assets import pawn, scene, stool
 from egs_warp.errors import UserError
 from egs_warp.io import write_ply
 from egs_warp.io.run_folder import MANIFEST, has_finished
-from tests.support.coarse import coarse_main
+from tests.support.coarse import NODES, coarse_main, coarse_maker
 from tests.support.disk_faults import assert_one_line, fail_once
+from tests.support.scenes import two_pawns_on_a_board
 
 PATIENCE = 900.0
 """Maximum time of a run on a busy machine, s."""
@@ -207,6 +208,33 @@ def test_a_world_continues_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.
         assert not (out / name / "trajectory.parts").exists()
     assert (out / "world.mp4").read_bytes() == (whole / "world.mp4").read_bytes()
     assert json.loads((out / MANIFEST).read_text())["finished"]
+
+
+@pytest.mark.slow
+def test_objects_of_a_scene_given_by_flags_continue_to_the_same_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run is interrupted before its film, its last steps are missing, and it is resumed from another folder,
+    without the cache."""
+    monkeypatch.setenv("EGS_WARP_CACHE", "")
+    monkeypatch.setattr("egs_warp.pipelines.scene_world.make_creature", coarse_maker(NODES))
+    write_ply(tmp_path / "room.ply", two_pawns_on_a_board())
+    monkeypatch.chdir(tmp_path)
+    flags = ["--object", "near=0,0,0.5", "--object", "far=1.5,0,0.5", "--prop", "far", "--motion", "near: jump to far"]
+    flags += ["--up", "z", "--straddling", "split", "--no-inpaint", "--frames", "20", "--size", "32"]
+    first = ["animate", "room.ply", *flags, "--save-collision-mesh", "mesh.glb", "--out"]
+    status = cli.main([*first, "whole"])
+    mesh = (tmp_path / "mesh.glb").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr("egs_warp.pipelines.animate_world.draw_world_film", interrupted)
+        assert cli.main([*first, "out"]) == 130
+    sorted((tmp_path / "out" / "near" / "trajectory.parts").glob("steps-*.npz"))[-1].unlink()
+    (tmp_path / "mesh.glb").unlink()
+    monkeypatch.chdir(tmp_path / "out")
+    assert cli.main(["resume", str(tmp_path / "out")]) == status
+    assert (tmp_path / "mesh.glb").read_bytes() == mesh
+    for name in ("near/trajectory.npz", "far/trajectory.npz", "world.mp4", "background.ply"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
 
 
 def interrupted(*_: object, **__: object) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial import KDTree
 
 from egs_warp.assets import scene
 from egs_warp.cli import main
@@ -20,6 +21,7 @@ from egs_warp.inpainting.holes import Hole, disc, footprint, unseen
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
 from egs_warp.inpainting.inpainters import OpenCvInpainter
 from egs_warp.inpainting.new_floor import rim_heights, with_gloss
+from egs_warp.inpainting.patch_synthesis import PatchSynthesis
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, diffuse_only, mean_colours, rectify
 from egs_warp.io import read_capture, write_ply
 from egs_warp.io.planes import PlaneRecord, write_planes
@@ -28,6 +30,7 @@ from egs_warp.segmentation.plane_fit import plane_depth
 from egs_warp.segmentation.votes import MaskedView
 from egs_warp.training.metrics import psnr
 from tests.support.floors import PLANE, floor, on_plane, pattern
+from tests.support.scenes import FLOOR, blocks, round_ones
 
 RADIUS = 0.22
 
@@ -236,6 +239,53 @@ def test_overhanging_objects_stay() -> None:
     )
     assert np.count_nonzero(PLANE.heights(result.cloud.means.numpy()) > RADIUS) == shelf.count
     assert result.removed == bare.removed > 0
+
+
+def test_the_sides_below_the_edge_of_a_floor_stay() -> None:
+    """The hole in the top of a block reaches 0.05 over its edge. All Gaussians of the sides stay; a Gaussian below the
+    middle of the hole is removed."""
+    block = blocks(((-0.5, -0.5, -0.6), (0.5, 0.5, 0.0)))
+    cloud = concatenate(block, round_ones(np.array([[0.1, 0.0, -0.3]]), 0.02))
+    hole = disc(FLOOR, np.array([0.1, 0.0, 0.0]), 0.45)
+    result = inpaint(cloud, hole, inpainter=OpenCvInpainter(), options=InpaintOptions(steps=0))
+    means = cloud.means.numpy()
+    is_side = (np.abs(means[:, :2]).max(axis=1) > 0.49) & (means[:, 2] < -0.15)
+    assert is_side.sum() > 1000 and result.is_retained[is_side].all()
+    assert not result.is_retained[-1]
+
+
+def test_a_narrow_rim_between_a_gap_and_the_edge_stays() -> None:
+    """The top of a block is known only at its edge, and a gap separates it from the hole. The edge stays, and the new
+    floor closes the gap."""
+    block = blocks(((-0.5, -0.5, -0.6), (0.5, 0.5, 0.0)))
+    means = block.means.numpy()
+    reach = np.abs(means[:, :2]).max(axis=1)
+    cloud = block.subset((reach > 0.48) | (means[:, 2] < -0.01))
+    mask = np.pad(np.ones((80, 80), bool), 10)
+    hole = Hole(PlaneWindow(FLOOR, np.zeros(3), 0.01, 100, 100), mask)
+    result = inpaint(cloud, hole, inpainter=OpenCvInpainter(), options=InpaintOptions(steps=0))
+    means = cloud.means.numpy()
+    assert result.is_retained[np.abs(means[:, :2]).max(axis=1) > 0.49].all()
+    new = result.cloud.subset(result.is_new).means.numpy()
+    across = np.linspace(-0.42, 0.42, 43)
+    grid = np.stack([*np.meshgrid(across, across), np.zeros((43, 43))], axis=-1).reshape(-1, 3)
+    assert KDTree(new).query(grid)[0].max() < 0.03 and np.abs(new[:, :2]).max() < 0.51
+
+
+def test_without_patches_the_colours_are_continued_smoothly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only if no inpainter was chosen."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise UserError("inpaint: no piece is known")
+
+    monkeypatch.setattr(PatchSynthesis, "fill", refuse)
+    truth, hole = floor(spacing=0.04), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
+    result = inpaint(holed(truth, hole), hole, options=InpaintOptions(steps=0))
+    assert result.notes[0] == "the colours around the hole were continued smoothly (inpaint: no piece is known)"
+    smooth = inpaint(holed(truth, hole), hole, inpainter=OpenCvInpainter(), options=InpaintOptions(steps=0))
+    np.testing.assert_array_equal(result.painted, smooth.painted)
+    with pytest.raises(UserError, match="no piece is known"):
+        inpaint(holed(truth, hole), hole, inpainter=PatchSynthesis(), options=InpaintOptions(steps=0))
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from egs_warp.contact.terrain import Solid
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
-from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
@@ -41,37 +37,6 @@ def test_facing_rotates_the_frame_and_not_the_body(place: Stance) -> None:
     other = place.with_forward(np.array([0.0, 2.0, 5.0]))
     assert np.allclose(other.ground.axes, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     assert other.standing is place.standing
-
-
-@pytest.mark.parametrize(("slope", "rise", "height"), [(0.1, 0.05, 0.2), (-0.1, -0.05, 0.2), (0.4, 0.2, 0.3)])
-def test_a_jump_lands_on_the_ground_ahead(place: Stance, slope: float, rise: float, height: float) -> None:
-    """The jump lands half a metre up or down a slope. Its apex is above the landing surface by at least half of the
-    requested height of 0.2."""
-    normal = np.array([-slope, 0.0, 1.0]) / np.hypot(1.0, slope)
-    target = replace(place, solids=(Solid((Plane(normal, 0.0),)),)).landing(JumpTarget(0.5, 0.2))
-    assert (target.distance, target.rise, target.height) == pytest.approx((0.5, rise, height))
-    assert place.landing(JumpTarget(0.5, 0.2)) == JumpTarget(0.5, 0.2)
-
-
-def test_a_jump_is_level_before_a_wall_over_an_edge_and_under_a_lintel(place: Stance) -> None:
-    """In each case the requested target is unchanged."""
-    ground, asked = Solid((Plane(np.array([0.0, 0.0, 1.0]), 0.0),)), JumpTarget(0.5, 0.2)
-    block = (Plane(np.array([0.0, 0.0, 1.0]), -2.5), Plane(np.array([-1.0, 0.0, 0.0]), 0.3))
-    lintel = Solid((*block, Plane(np.array([0.0, 0.0, -1.0]), 2.0)))
-    table = Solid((ground.faces[0], Plane(np.array([1.0, 0.0, 0.0]), -0.3)))
-    for solids in ((ground, Solid(block)), (ground, lintel), (table,)):
-        assert replace(place, solids=solids).landing(asked) == asked
-
-
-@pytest.mark.parametrize("name", ["jump", "twist"])
-def test_motions_jump_onto_the_solid_ahead(place: Stance, name: str) -> None:
-    step = Solid((Plane(np.array([0.0, 0.0, 1.0]), -0.1), Plane(np.array([-1.0, 0.0, 0.0]), 0.3)))
-    ground = Solid((Plane(np.array([0.0, 0.0, 1.0]), 0.0),))
-    target, stepped = JumpTarget(0.5, 0.2), replace(place, solids=(ground, step))
-    begun = (
-        motion("jump 0.5 0.2").parts(1.0)[0].begin(stepped) if name == "jump" else Turn(stepped, target, 0.5).jumps[0]
-    )
-    assert isinstance(begun, Jump) and begun.target.rise == pytest.approx(0.1)
 
 
 class Waits:

@@ -7,8 +7,13 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
-from egs_warp.motions.sequence import Stance
+from egs_warp.motions.script import motion, own_script
+from egs_warp.motions.sequence import BodyMotion, Stance, TargetError
 from egs_warp.motions.stand import PostureTarget, Stand
+from egs_warp.pipelines.end_state import State
+from egs_warp.pipelines.report import motion_reports
+from egs_warp.pipelines.simulated_run import simulate
+from tests.support.creatures import coarse_pawn
 from tests.support.stances import DT, block_place
 
 
@@ -53,3 +58,16 @@ def test_the_body_turns_to_its_posture(place: Stance) -> None:
     rate = place.ground.axes @ np.linalg.solve(place.body.inertia(place.standing), spin)
     unit = np.sqrt(np.linalg.norm(place.body.gravity) / place.body.height)
     assert np.allclose(rate, [0.0, 0.04 * unit, 0.0], atol=1e-6)
+
+
+def test_a_target_out_of_reach_during_a_run_is_a_missed_target() -> None:
+    """The run stands in place of the motion, continues with the next one, and reports the target as missed."""
+
+    def far(stance: Stance) -> BodyMotion:
+        raise TargetError("kick: king is 3.00 body heights away")
+
+    script = motion("stand 0.05") + own_script("far", far, seconds=1.0) + motion("stand 0.05")
+    run = simulate(coarse_pawn(), script)
+    reports = motion_reports(run.trajectory, run.records, run.ending)
+    assert [each.state for each in reports] == [State.DONE, State.NOT_AS_REQUESTED, State.DONE]
+    assert reports[1].notes == ("not as requested: kick: king is 3.00 body heights away",)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.motions.steering import free_direction, steering_command
+from egs_warp.motions.steering import SPEED, free_direction, steering_command
 
 GOAL = np.array([4.0, 0.0])
 
@@ -58,3 +58,35 @@ def test_a_command_turns_on_the_spot_only_for_large_angles() -> None:
     assert going.forward > 0.1 and going.turn < 0.0
     # Across the discontinuity of the angle.
     assert steering_command(3.0, np.array([np.cos(-3.0), np.sin(-3.0)])).turn > 0.0
+
+
+def test_eight_walkers_cross_a_circle_without_touching() -> None:
+    """Discs that turn and walk as commanded, without mechanics, all reach the opposite side of a circle."""
+    count, radius, touching, dt = 8, 1.5, 0.45, 0.1
+    angles = 2.0 * np.pi * np.arange(count) / count
+    at = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    goals, headings, before = -at, angles + np.pi, at.copy()
+    speed_unit = 9.81**0.5
+    for _ in range(300):
+        velocities, before = (at - before) / dt, at.copy()
+        for each in range(count):
+            if np.linalg.norm(goals[each] - at[each]) < 0.05:
+                continue
+            others = [other for other in range(count) if other != each]
+            discs = [(before[other], velocities[other], touching + 0.08) for other in others]
+            heading = free_direction(
+                before[each],
+                goals[each],
+                discs,
+                lambda point: False,
+                speed=SPEED * speed_unit,
+                height=1.0,
+                horizon=12.0 / speed_unit,
+            )
+            command = steering_command(headings[each], heading)
+            headings[each] += dt * speed_unit * command.turn
+            along = np.array([np.cos(headings[each]), np.sin(headings[each])])
+            at[each] += dt * speed_unit * command.forward * along
+        apart = np.linalg.norm(at[:, None] - at[None], axis=-1) + 10.0 * np.eye(count)
+        assert apart.min() > touching
+    assert np.linalg.norm(goals - at, axis=1).max() < 0.05

@@ -88,6 +88,7 @@ def test_mistakes_are_reported(text: str, message: str) -> None:
 
 
 def test_coordinates_are_no_names() -> None:
-    check_motion("walk to 1,0.5, jump 0.5, walk to ahead=1 left=0, push king to 1,-0.5, kick king 1.2 0.4")
+    names = ["king"]
+    check_motion("walk to 1,0.5, jump 0.5, walk to ahead=1 left=0, push king to 1,-0.5, kick king 1.2 0.4", names)
     with pytest.raises(UserError, match="unknown motion 'fly'"):
-        check_motion("face king, fly")
+        check_motion("face king, fly", names)

@@ -19,6 +19,7 @@ from egs_warp.geometry.rigid_path import RigidPath
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.motions.jump_plan import JumpTarget
+from egs_warp.motions.landing import landing_of
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.simulated_run import simulate
@@ -186,7 +187,7 @@ def test_a_body_is_placed_as_captured_and_stands_on_another_one() -> None:
     stance = initial_stance(placed)
     np.testing.assert_allclose(stance.ground.origin[2], 0.4 * own.scale, atol=0.03)
     assert len(stance.contact_points) > 3 and len(stance.feet()) == len(initial_stance(creature).feet())
-    lower = stance.landing(JumpTarget(distance=2.0, height=0.2))
+    lower = landing_of(stance, JumpTarget(distance=2.0, height=0.2))
     assert lower.rise == pytest.approx(-0.4 * own.scale, abs=0.03)
     with pytest.raises(UserError, match="the world has no surroundings"):
         World().add(creature, as_captured=True)

@@ -26,6 +26,15 @@ UP = np.array([0.0, 0.0, 1.0])
         ("bodies:\n- {capture: a.ply, motion: fly}\n", "line 2: .*fly"),
         ("bodies:\n- {capture: a.ply}\nobstacles:\n- box: {at: [0, 0]}\n", "line 4: obstacles.1.box: size is missing"),
         ("bodies:\n- {capture: missing.ply}\n", "line 2: .*missing.ply"),
+        (
+            "scene: missing.ply\nbodies:\n- {object: '0,0,1'}\n- {capture: a b.ply, motion: kick a-c}\n",
+            r"line 4: motion 1 \('kick a-c'\): no body 'a-c'; give one of object-1",
+        ),
+        (
+            "bodies:\n- {capture: a b.ply}\n- {capture: a b.ply, motion: jump to a-b}\n"
+            "- {capture: a.ply, motion: kick b}\n",
+            r"line 4: .*no body 'b'.*; give one of a-b, a-b-2",
+        ),
         ("bodies:\n- {capture: a.ply, object: '0,0,1'}\n", "line 2: bodies.1: both capture and object are given"),
         ("bodies:\n- {object: '0,0,1'}\n", "line 2: object is for a scene; add scene"),
         ("bodies:\n- {capture: a.ply}\ncameras: c\n", "line 3: cameras is for a scene"),

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import warp as wp
 from PIL import Image
 
+from egs_warp.assets import pawn
 from egs_warp.geometry.camera_ring import ring_cameras
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate, with_degree
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import write_ply
 from egs_warp.io.cameras import write_cameras
@@ -97,3 +100,11 @@ def blocks(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]]
     return GaussianCloud.from_numpy(
         means, quaternions, scales, np.full(count, 4.0), np.zeros((count, 1, 3)), device="cpu"
     )
+
+
+def two_pawns_on_a_board() -> GaussianCloud:
+    """Return two pawns 1.5 apart along x on a board of 4.5 x 3, with a block beside them."""
+    thing = pawn(gaussian_count=3000, device="cpu").cloud
+    shifted = replace(thing, means=wp.array(thing.means.numpy() + np.array([1.5, 0.0, 0.0], np.float32), dtype=wp.vec3))
+    board = blocks(((-1.5, -1.5, -0.04), (3.0, 1.5, 0.0)), ((0.6, 0.9, 0.0), (1.0, 1.3, 0.5)))
+    return concatenate(*(with_degree(each, 0) for each in (thing, shifted, board)))

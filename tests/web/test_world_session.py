@@ -89,6 +89,24 @@ def test_each_page_steers_its_own_creature(session: WorldSession) -> None:
     assert session.pages == []
 
 
+def test_a_page_that_leaves_does_not_end_the_pull_of_another(session: WorldSession) -> None:
+    """Both pages steer the same creature, and only the first one pulls it."""
+    feed = WorldFeed(session, title="two.yaml")
+    first, second = _connected(feed), _connected(feed)
+    second.receive({"type": "select", "body": "left"})
+    forces = session.bodies[0].forces
+    messages: list[dict[str, object]] = [{"type": "release"}, {"type": "select", "body": "left"}]
+    for message in messages:
+        first.receive({"type": "pull", "node": 3, "x": 0.0, "y": 0.0, "z": 2.0})
+        second.receive(message)
+        session.process_requests()
+        assert forces.is_pulling
+    second.close()
+    assert forces.is_pulling
+    first.close()
+    assert not forces.is_pulling
+
+
 def test_a_world_without_a_creature_is_refused() -> None:
     with pytest.raises(UserError, match="world: it has no creature to steer"):
         WorldSession(World(), [])
