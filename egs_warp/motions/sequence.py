@@ -21,6 +21,7 @@ from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.limbs import Limbs
 from egs_warp.motions.stance import GroundFrame, heading_between, sole_shares
 from egs_warp.motions.style import Style
+from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.short_repr import short_repr
 
 if TYPE_CHECKING:
@@ -56,6 +57,8 @@ class Stance:
     """Limbs of the capture; None uses the limbs of the cage."""
     style: Style = field(default_factory=Style)
     """Style of jumps."""
+    muscles: MuscleSet | None = None
+    """Muscles of the body; None if their strength is unknown."""
 
     def feet(self) -> tuple[Foot, ...]:
         """Return the feet of the body, see ``find_feet``."""
