@@ -166,6 +166,7 @@ class GetUp:
         self._aim = self._margin = self._excess = self._start_degrees = 0.0
         self._rise = self._shortfall = 0.0
         self._axis = np.zeros(3)
+        self._ground_level = 0.0
         self._stand: Stand | None = None
         self._weakness: str | None = None
         self._degrees = self._base_degrees = 180.0
@@ -231,7 +232,10 @@ class GetUp:
         momentum = body.angular_momentum(x, state.velocities)
         momentum = momentum + body.mass * np.cross(arm, body.centre_of_mass(state.velocities))
         path = tipping_path(body.node_mass, self._arms @ turn.T, axis, angle, normal)
-        rise = max(path.top - float((com - self.ground.origin) @ normal), 0.0)
+        if self.phase is GetUpPhase.LIE:
+            # The frame of a fallen body is at the height of its base, which may be off the ground.
+            self._ground_level = float((x @ normal).min())
+        rise = max(path.top + self._ground_level - float(com @ normal), 0.0)
         behind, rear = 0.0, float((edge - com) @ ahead)
         if report is not None and report.contacts.count:
             points = np.einsum("cw,cwi->ci", report.contacts.weights, x[report.contacts.nodes])
@@ -270,6 +274,7 @@ class GetUp:
             self._excess = 0.5 * roll.inertia * roll.rate * abs(roll.rate) / self.body.weight - roll.missing
             rolls_back = roll.rate * self._unit < -_FAIL_RATE and self._degrees > _LANDED_ANGLE
             if self._base_degrees < _LANDED_ANGLE and load > 0.05 and self._has_captured(roll):
+                self._shortfall = 0.0
                 self._catch(state, GetUpPhase.CATCH, _CROUCH_FRACTION)
             elif elapsed > _MAX_ROLL_TIME or (elapsed > _FAIL_TIME and rolls_back):
                 self._enter(GetUpPhase.LIE, state.time)

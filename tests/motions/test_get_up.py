@@ -109,6 +109,15 @@ def test_a_ball_cannot_fall_over() -> None:
         GetUp(ball.place)
 
 
+def test_the_height_does_not_depend_on_the_frame_of_the_fallen_body() -> None:
+    """The stance of a fallen body has its origin at the height of its base, above the ground."""
+    state = lying(90.0)
+    fallen = block().place.moved_to(state.positions)
+    assert fallen.ground.origin[2] > 0.1
+    missing = [GetUp(place)._measure(state, None).missing for place in (block().place, fallen)]
+    assert missing[0] == pytest.approx(missing[1]) and missing[0] == pytest.approx(0.31, abs=0.03)
+
+
 def given_up(get_up: GetUp, state: BodyState) -> str:
     """Return the note of a body that never moves."""
     for step in range(3000):
