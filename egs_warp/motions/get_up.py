@@ -40,7 +40,7 @@ _STROKE = 0.12
 """Angle of the roll in radians over which a body can push itself up."""
 _MIN_STROKE = 0.04
 """Smallest remaining angle in radians over which a push is planned."""
-_MIN_MARGIN, _MAX_MARGIN = 0.03, 0.05
+_MIN_MARGIN, _MAX_MARGIN = 0.05, 0.07
 """Bounds of the planned excess of the energy at the top of the roll, as a height in body heights."""
 _PASSED_HEIGHT = 0.005
 """Missing height in body heights below which a body has passed the top of the roll."""
