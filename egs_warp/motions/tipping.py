@@ -13,20 +13,20 @@ from scipy.spatial.transform import Rotation
 
 _ANGLE_STEP = np.radians(2.0)
 """Angle between the orientations at which heights are computed, radians."""
-_ANGLE_BEYOND = 0.5 * np.pi
-"""Angle beyond the upright orientation up to which the barrier on the other side is searched, radians."""
+_NEXT_EDGE_ANGLE = 0.5 * np.pi
+"""Angle past the upright orientation up to which the barrier on the other side is searched, radians."""
 
 
 @dataclass(frozen=True)
 class TippingPath:
-    """Heights of the centre of mass above the ground while a body is rotated to upright, and beyond, in contact with
-    the ground."""
+    """Heights of the centre of mass above the ground while a body is rotated to upright, and over the next edge, in
+    contact with the ground."""
 
     top: float
     """m, maximum height on the way to upright."""
     upright: float
     """m, height of the upright body."""
-    beyond: float
+    next_top: float
     """m, first maximum of the height on the way from upright to the other side."""
     speed_ratio: float
     """Angular velocity about the last edge, divided by the angular velocity about the first edge before the base lands
@@ -41,7 +41,7 @@ class TippingPath:
         even if it is at rest at the top, unless its muscles brake it."""
         if self.speed_ratio <= 0.0:
             return np.inf
-        return (self.beyond - self.upright) / (self.speed_ratio**2 * self.inertia_ratio) - (self.top - self.upright)
+        return (self.next_top - self.upright) / (self.speed_ratio**2 * self.inertia_ratio) - (self.top - self.upright)
 
 
 def tipping_path(
@@ -58,7 +58,7 @@ def tipping_path(
     """
     before = max(int(np.ceil(angle / _ANGLE_STEP)), 1)
     angles = np.concatenate(
-        [np.linspace(0.0, angle, before + 1), angle + np.arange(_ANGLE_STEP, _ANGLE_BEYOND, _ANGLE_STEP)]
+        [np.linspace(0.0, angle, before + 1), angle + np.arange(_ANGLE_STEP, _NEXT_EDGE_ANGLE, _ANGLE_STEP)]
     )
     levels = Rotation.from_rotvec(-angles[:, None] * axis).apply(normal) @ arms.T
     lowest, heights = levels.argmin(axis=1), -levels.min(axis=1)
@@ -71,7 +71,7 @@ def tipping_path(
     return TippingPath(
         top=float(heights[highest]),
         upright=float(heights[before]),
-        beyond=float(heights[last]),
+        next_top=float(heights[last]),
         speed_ratio=(about_centre + mass * float(first_edge @ last_edge)) / about_last,
         inertia_ratio=about_last / (about_centre + mass * float(first_edge @ first_edge)),
     )

@@ -28,7 +28,7 @@ def test_heights_of_a_block(degrees: float) -> None:
     angle = np.radians(degrees)
     start = 0.5 * HEIGHT * np.cos(angle) + 0.5 * WIDTH * np.sin(angle)
     assert path.top == pytest.approx(diagonal if degrees > 30.0 else start, rel=1e-3)
-    assert path.upright == pytest.approx(0.5 * HEIGHT) and path.beyond == pytest.approx(diagonal, rel=1e-3)
+    assert path.upright == pytest.approx(0.5 * HEIGHT) and path.next_top == pytest.approx(diagonal, rel=1e-3)
 
 
 def test_excess_of_a_block() -> None:
@@ -39,4 +39,4 @@ def test_excess_of_a_block() -> None:
     ratio = (square + 0.25 * (HEIGHT**2 - WIDTH**2)) / (2.0 * square)
     assert path.speed_ratio == pytest.approx(ratio) and path.inertia_ratio == pytest.approx(1.0)
     before = path.max_excess + path.top - path.upright
-    assert ratio**2 * before == pytest.approx(path.beyond - path.upright)
+    assert ratio**2 * before == pytest.approx(path.next_top - path.upright)
