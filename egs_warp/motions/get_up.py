@@ -26,28 +26,37 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.gait import smooth
+from egs_warp.motions.push_capacity import push_capacity
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import RestDetector
 from egs_warp.motions.stand import Stand
+from egs_warp.motions.tipping import TippingPath, tipping_path
 
 MAX_UPRIGHT_TILT = 15.0
 """Largest tilt in degrees of a body that has got up and stands at rest."""
-_ATTEMPTS = ((1.2, 0.1), (1.6, 0.1), (1.0, 0.05), (1.3, 0.2), (2.2, 0.1), (1.6, 0.2), (3.0, 0.15), (1.0, 0.15))
-"""For each attempt, the push relative to the smallest sufficient push over ``_STROKE``, and the height in body heights
-by which the target of the centre of mass exceeds the top of the roll."""
-_STROKE = 0.35
+MAX_TRIES = 3
+"""Maximum number of tries."""
+_STROKE = 0.12
 """Angle of the roll in radians over which a body can push itself up."""
+_MIN_STROKE = 0.04
+"""Smallest remaining angle in radians over which a push is planned."""
+_MIN_MARGIN, _MAX_MARGIN = 0.05, 0.07
+"""Bounds of the planned excess of the energy at the top of the roll, as a height in body heights."""
+_PASSED_HEIGHT = 0.005
+"""Missing height in body heights below which a body has passed the top of the roll."""
+_MIN_LIFT_SHARE = 0.5
+"""Share of the required height that the first push has to reach for another try."""
 _PUSH_RAMP_TIME = 0.4
 """Time in sqrt(H / g) in which a push grows to its full size."""
-_MIN_TOP_RATE = 0.25
-"""Smallest target rate at the top of the roll, in radians per sqrt(H / g)."""
-_MAX_BRAKING = 4.0
-"""Largest deceleration of the roll, in radians per H / g."""
 _BASE_HEIGHT = 0.3
 """Height in body heights above the sole of the standing body up to which nodes belong to the base."""
 _EDGE_ANGLE = 35.0
 """Angle in degrees that determines the edge over which the body rolls: the nodes of the edge would touch first if the
 ground were steeper by this angle, or by half of the tilt of the base if that is smaller."""
+_EDGE_BAND = 0.005
+"""Depth in body heights of the nodes of the edge."""
+_TOUCHING_HEIGHT = 0.02
+"""Height in body heights above the lowest node up to which nodes of a lying body can push."""
 _LANDED_ANGLE = 20.0
 """Maximum tilt in degrees of a base that is considered landed."""
 _CROUCH_FRACTION = 0.75
@@ -60,8 +69,8 @@ _MAX_LIE_TIME, _MAX_ROLL_TIME, _MAX_STRAIGHTEN_TIME = 6.0, 6.0, 10.0
 _FAIL_TIME, _FAIL_RATE = 0.6, 0.05
 """Time in sqrt(H / g) after which an attempt fails if the body rolls back, and minimum rate of rolling back in radians
 per sqrt(H / g)."""
-_MAX_BASE_TILT = 60.0
-"""Maximum tilt of the base of a standing body, degrees."""
+_MAX_CATCH_TILT = 40.0
+"""Maximum tilt in degrees of a body, or of its base, that can still come to rest on its base."""
 
 
 class GetUpPhase(Enum):
@@ -115,14 +124,19 @@ class _Roll:
     """kg m^2, moment of inertia about the edge."""
     rate: float
     """rad/s, angular velocity about the edge."""
+    edge_nodes: np.ndarray
+    """(k,) nodes of the edge."""
+    path: TippingPath
     missing: float
     """Height in metres by which the centre of mass still has to rise to pass the top of the roll."""
+    rear: float
+    """Distance in metres, ahead of the centre of mass, of the rear end of the support."""
     pushes: bool
     """True if the ground supports the body behind the edge."""
 
 
 class GetUp:
-    """Push the body up and stand; give up if all ``_ATTEMPTS`` fail."""
+    """Push the body up and stand; give up after ``MAX_TRIES``, or at once if the muscles are too weak."""
 
     def __init__(self, stance: Stance, *, control: GetUpControl | None = None) -> None:
         """Create the motion.
@@ -149,8 +163,12 @@ class GetUp:
         self._rest_detector = RestDetector(body)
         self.phase, self._entered = GetUpPhase.LIE, -1.0
         self.tries = 0
-        self._push, self._margin = 0.0, 0.0
+        self._aim = self._margin = self._excess = self._start_degrees = 0.0
+        self._rise = self._shortfall = 0.0
+        self._axis = np.zeros(3)
+        self._ground_level = 0.0
         self._stand: Stand | None = None
+        self._weakness: str | None = None
         self._degrees = self._base_degrees = 180.0
 
     @property
@@ -172,18 +190,16 @@ class GetUp:
 
     def plan_record(self) -> GetUpPlan:
         """Return the maximum number of attempts."""
-        return GetUpPlan(float(len(_ATTEMPTS)))
+        return GetUpPlan(float(MAX_TRIES))
 
     def planned_com(self, elapsed: float) -> None:
         """Return None: each attempt starts from the measured body."""
 
     def notes(self) -> list[str]:
         """Return messages for the user about a body that stays on the ground."""
-        return (
-            [f"the body does not get up: it still lies after {self.tries} tries"]
-            if self.phase is GetUpPhase.GIVEN_UP
-            else []
-        )
+        if self.phase is not GetUpPhase.GIVEN_UP:
+            return []
+        return [f"cannot get up: {self._weakness or f'it still lies after {self.tries} tries'}"]
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> GetUpOutcome:
         """Return the number of attempts."""
@@ -202,24 +218,41 @@ class GetUp:
     def _measure(self, state: BodyState, report: StepReport | None) -> _Roll:
         body, up, normal = self.body, self.ground.axes[2], self.ground.surface_normal
         x, com = state.positions, body.centre_of_mass(state.positions)
-        angle, axis = self._tilt(x)
-        base_angle, _ = self._tilt(x, self._base)
+        angle, axis, turn = self._tilt(x)
+        base_angle, _, _ = self._tilt(x, self._base)
         self._degrees, self._base_degrees = float(np.degrees(angle)), float(np.degrees(base_angle))
         ahead = np.cross(axis, up)
         steeper = min(0.5 * base_angle, np.radians(_EDGE_ANGLE))
         first = np.cos(steeper) * ((x - self.ground.origin) @ normal) - np.sin(steeper) * (x @ ahead)
-        edge = x[first < first.min() + 0.005 * body.height].mean(axis=0)
+        edge_nodes = np.flatnonzero(first < first.min() + _EDGE_BAND * body.height)
+        edge = x[edge_nodes].mean(axis=0)
         arm = com - edge
         arm = arm - (arm @ axis) * axis
         inertia = float(axis @ body.inertia(x) @ axis) + body.mass * float(arm @ arm)
         momentum = body.angular_momentum(x, state.velocities)
         momentum = momentum + body.mass * np.cross(arm, body.centre_of_mass(state.velocities))
-        rise = max(self._top(x - com, axis, angle) - float((com - self.ground.origin) @ normal), 0.0)
-        behind = 0.0
+        path = tipping_path(body.node_mass, self._arms @ turn.T, axis, angle, normal)
+        if self.phase is GetUpPhase.LIE:
+            # The frame of a fallen body is at the height of its base, which may be off the ground.
+            self._ground_level = float((x @ normal).min())
+        rise = max(path.top + self._ground_level - float(com @ normal), 0.0)
+        behind, rear = 0.0, float((edge - com) @ ahead)
         if report is not None and report.contacts.count:
             points = np.einsum("cw,cwi->ci", report.contacts.weights, x[report.contacts.nodes])
-            behind = float(report.forces[(points - edge) @ ahead < -_MIN_PUSH_DISTANCE * body.height, 0].sum())
-        return _Roll(axis, arm, inertia, float(axis @ momentum) / inertia, rise, behind > 0.02 * body.weight)
+            loads, places = report.forces[:, 0], (points - com) @ ahead
+            rear = float(places[loads > 0.0].min(initial=rear))
+            behind = float(loads[places < float((edge - com) @ ahead) - _MIN_PUSH_DISTANCE * body.height].sum())
+        return _Roll(
+            axis,
+            arm,
+            inertia,
+            float(axis @ momentum) / inertia,
+            edge_nodes,
+            path,
+            rise,
+            rear,
+            behind > 0.02 * body.weight,
+        )
 
     def _advance(self, state: BodyState, report: StepReport | None, roll: _Roll) -> None:
         if self._entered < 0.0:
@@ -231,28 +264,84 @@ class GetUp:
         if self.phase is GetUpPhase.LIE and (calm or elapsed > _MAX_LIE_TIME):
             if upright:
                 self._catch(state, GetUpPhase.STAND, 1.0)
-            elif self.tries == len(_ATTEMPTS):
+            elif self.tries == MAX_TRIES or self._is_too_weak(state, roll) or self._fell_far_short():
                 self._enter(GetUpPhase.GIVEN_UP, state.time)
             else:
-                push, margin = _ATTEMPTS[self.tries]
-                needed = max(roll.missing, 0.02 * self.body.height)
-                self._push = push * self.body.mass * self._gravity * needed / (roll.inertia * _STROKE)
-                self._margin = margin * self.body.height
-                self.tries += 1
+                self._begin_try(roll)
                 self._enter(GetUpPhase.ROLL, state.time)
         elif self.phase is GetUpPhase.ROLL:
+            self._shortfall = min(self._shortfall, roll.missing)
+            self._excess = 0.5 * roll.inertia * roll.rate * abs(roll.rate) / self.body.weight - roll.missing
             rolls_back = roll.rate * self._unit < -_FAIL_RATE and self._degrees > _LANDED_ANGLE
-            if self._base_degrees < _LANDED_ANGLE and load > 0.05:
+            if self._base_degrees < _LANDED_ANGLE and load > 0.05 and self._has_captured(roll):
+                self._shortfall = 0.0
                 self._catch(state, GetUpPhase.CATCH, _CROUCH_FRACTION)
             elif elapsed > _MAX_ROLL_TIME or (elapsed > _FAIL_TIME and rolls_back):
                 self._enter(GetUpPhase.LIE, state.time)
         elif self.phase in (GetUpPhase.CATCH, GetUpPhase.STAND):
             assert self._stand is not None
             late = elapsed > _MAX_STRAIGHTEN_TIME
-            if self._base_degrees > _MAX_BASE_TILT or (late and not upright):
+            if max(self._degrees, self._base_degrees) > _MAX_CATCH_TILT or (late and not upright):
                 self._enter(GetUpPhase.LIE, state.time)
             elif self.phase is GetUpPhase.CATCH and upright and (self._stand.is_at_rest or late):
                 self._catch(state, GetUpPhase.STAND, 1.0)
+
+    def _has_captured(self, roll: _Roll) -> bool:
+        """Return True if the capture point has passed the rear of the support, so that the body does not roll back."""
+        height = max(float(roll.arm @ self.ground.axes[2]), _PASSED_HEIGHT * self.body.height)
+        # A body that rolls rigidly about the edge has the angular momentum J w = m h v about it.
+        velocity = roll.inertia * roll.rate / (self.body.mass * height)
+        return velocity * np.sqrt(height / self._gravity) > roll.rear
+
+    def _is_too_weak(self, state: BodyState, roll: _Roll) -> bool:
+        """Return True if one push of the muscles cannot lift the centre of mass over the edge, and note why."""
+        muscles, body, up = self._stance.muscles, self.body, self.ground.axes[2]
+        if muscles is None or muscles.segment_count == 0 or self.tries > 0:
+            return False
+        x = state.positions
+        low = (x - self.ground.origin) @ self.ground.surface_normal
+        behind = (body.centre_of_mass(x) - roll.arm - x) @ np.cross(roll.axis, up)
+        touching = np.flatnonzero(low < low.min() + _TOUCHING_HEIGHT * body.height)
+        far = touching[behind[touching].argmax()]
+        if behind[far] < _MIN_PUSH_DISTANCE * body.height:
+            return False
+        push = push_capacity(body, muscles, x, np.array([far]), roll.edge_nodes, self.ground.surface_normal)
+        torque = -body.weight * float(roll.arm @ np.cross(roll.axis, up))
+        lift = push.work / body.weight if push.force * behind[far] > torque else 0.0
+        if lift > roll.missing:
+            return False
+        self._weakness = (
+            f"a push of its muscles lifts the centre of mass by at most {lift / body.height:.2g} body heights, and the "
+            f"roll over the edge of its base takes {roll.missing / body.height:.2g}"
+        )
+        return True
+
+    def _fell_far_short(self) -> bool:
+        """Return True if the last push lifted the centre of mass by less than ``_MIN_LIFT_SHARE`` of the required
+        height, and note why."""
+        lift = self._rise - self._shortfall
+        if self.tries == 0 or lift >= _MIN_LIFT_SHARE * self._rise:
+            return False
+        self._weakness = (
+            f"its push lifted the centre of mass by {max(lift, 0.0) / self.body.height:.2f} of the "
+            f"{self._rise / self.body.height:.2f} body heights that the roll over the edge of its base takes"
+        )
+        return True
+
+    def _begin_try(self, roll: _Roll) -> None:
+        """Plan a try. Correct the planned excess by the measured excess of the last roll, at least by half."""
+        height = self.body.height
+        if self.tries == 0:
+            self._aim = float(np.clip(0.5 * roll.path.max_excess, _MIN_MARGIN * height, _MAX_MARGIN * height))
+            self._margin = self._aim
+        elif roll.axis @ self._axis < 0.0:
+            self._margin -= max(self._excess - self._aim, 0.5 * self._aim)
+        else:
+            self._margin += max(self._aim - self._excess, 0.5 * self._aim)
+        self._start_degrees = self._degrees
+        self._rise = self._shortfall = roll.missing
+        self._axis = roll.axis
+        self.tries += 1
 
     def _enter(self, phase: GetUpPhase, time: float) -> None:
         self.phase, self._entered = phase, time
@@ -261,7 +350,9 @@ class GetUp:
         self._stand = Stand(self._stance.moved_to(state.positions), at_rest=False, crouch=crouch)
         self._enter(phase, state.time)
 
-    def _tilt(self, positions: np.ndarray, nodes: np.ndarray | slice = slice(None)) -> tuple[float, np.ndarray]:
+    def _tilt(
+        self, positions: np.ndarray, nodes: np.ndarray | slice = slice(None)
+    ) -> tuple[float, np.ndarray, np.ndarray]:
         """Return the tilt from upright of the body, or of some of its ``nodes``, in radians, and the horizontal axis
         (3,), world axes, about which a rotation by the tilt makes it upright."""
         mass, arms, up = self.body.node_mass[nodes], self._arms[nodes], self.ground.axes[2]
@@ -271,15 +362,7 @@ class GetUp:
         axis = np.cross(head, up)
         size = float(np.linalg.norm(axis))
         angle = float(np.arctan2(size, head @ up))
-        return angle, axis / size if size > 1e-9 else self.ground.axes[0]
-
-    def _top(self, arms: np.ndarray, axis: np.ndarray, angle: float) -> float:
-        """Return the maximum height in metres of the centre of mass above the ground while a body rolls about ``axis``
-        (3,) by ``angle`` radians, over all edges on its path; ``arms`` (N, 3) are the nodes relative to the centre of
-        mass."""
-        normal = self.ground.surface_normal
-        turns = Rotation.from_rotvec(np.linspace(0.0, angle, max(int(np.degrees(angle) / 3.0), 2))[:, None] * axis)
-        return float((-(turns.inv().apply(normal) @ arms.T).min(axis=1)).max())
+        return angle, axis / size if size > 1e-9 else self.ground.axes[0], turn
 
     def _roll_objectives(self, state: BodyState, roll: _Roll, dt: float) -> list[AnyObjective]:
         """Return objectives for the centre of mass and the spin of a body that rolls rigidly about its edge, at the
@@ -293,10 +376,7 @@ class GetUp:
         if carried:
             rate = roll.rate + dt * weight * float(roll.arm @ ahead) / roll.inertia
         else:
-            rise = roll.missing + (self._margin if roll.missing > 0.01 * body.height else 0.0)
-            target_rate = float(np.sqrt(2.0 * weight * rise / roll.inertia + (_MIN_TOP_RATE / unit) ** 2))
-            push = self._push * max(smooth(elapsed / (_PUSH_RAMP_TIME * unit)), 0.1)
-            rate = roll.rate + float(np.clip(target_rate - roll.rate, -_MAX_BRAKING * dt / unit**2, push * dt))
+            rate = roll.rate + dt * self._push_acceleration(roll, elapsed)
         velocity = rate * np.cross(roll.axis, roll.arm)
         if carried:
             pose = node_velocities(body, velocity + rate * np.cross(roll.axis, arms), control.carried)
@@ -309,6 +389,18 @@ class GetUp:
             AngularMomentumObjective(body.inertia(state.positions) @ (rate * roll.axis), control.spin),
             pose,
         ]
+
+    def _push_acceleration(self, roll: _Roll, elapsed: float) -> float:
+        """Return the angular acceleration in rad/s^2 of a body that pushes itself up. Over the rest of its stroke, a
+        constant torque adds the energy that the body lacks to pass the top with the planned excess."""
+        weight = self.body.weight
+        kinetic = 0.5 * roll.inertia * max(roll.rate, 0.0) ** 2
+        rise = roll.missing + (self._margin if roll.missing > _PASSED_HEIGHT * self.body.height else 0.0)
+        rolled = np.radians(self._start_degrees - self._degrees)
+        # Contacts behind the edge can only push.
+        torque = max(weight * rise - kinetic, 0.0) / max(_STROKE - rolled, _MIN_STROKE)
+        ramp = max(smooth(elapsed / (_PUSH_RAMP_TIME * self._unit)), 0.1)
+        return float((ramp * torque + weight * (roll.arm @ np.cross(roll.axis, self.ground.axes[2]))) / roll.inertia)
 
 
 def lie_down(stance: Stance, degrees: float, axis: np.ndarray) -> np.ndarray:

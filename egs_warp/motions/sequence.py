@@ -20,6 +20,7 @@ from egs_warp.motions.feet import Foot, SupportKind, find_feet, support_kind_of
 from egs_warp.motions.limbs import Limbs
 from egs_warp.motions.stance import GroundFrame, heading_between, sole_shares
 from egs_warp.motions.style import Style
+from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.short_repr import short_repr
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ class Stance:
     """Limbs of the capture; None uses the limbs of the cage."""
     style: Style = field(default_factory=Style)
     """Style of jumps."""
+    muscles: MuscleSet | None = None
+    """Muscles of the body; None if their strength is unknown."""
 
     def feet(self) -> tuple[Foot, ...]:
         """Return the feet of the body, see ``find_feet``."""

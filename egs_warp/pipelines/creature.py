@@ -394,4 +394,5 @@ def initial_stance(creature: Creature, *, step: float | None = None, style: Styl
         creature.geometry.friction,
         creature.limbs,
         style or Style(),
+        creature.stepper.muscles,
     )

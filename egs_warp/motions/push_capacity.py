@@ -1,0 +1,70 @@
+"""Largest work of one push against the ground, from the strength of the muscles and the elasticity of the body.
+
+The body is a linear spring in its present shape. Its muscles, at the bounds of their activations, move a point on the
+ground by the distance d relative to the edge about which the body rolls. If the ground keeps the point in place, they
+press on it with the force F = d / c instead, where c is the compliance between point and edge. So a push over the whole
+distance does at most the work F d / 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.fem.body import SoftBody
+from egs_warp.fem.multifrontal import MultifrontalLdl
+from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.muscles.tension import activation_jacobian
+
+_SOFTNESS = 1e-6
+"""Diagonal term that makes the stiffness of a free body regular, relative to its largest entry."""
+
+
+@dataclass(frozen=True)
+class PushCapacity:
+    """Capacity of the muscles to push a point away from the body."""
+
+    force: float
+    """N, largest force on a point that does not move."""
+    stroke: float
+    """m, largest distance by which the point moves without a force."""
+
+    @property
+    def work(self) -> float:
+        """Largest work of one push, J."""
+        return 0.5 * self.force * self.stroke
+
+
+def push_capacity(
+    body: SoftBody, muscles: MuscleSet, positions: np.ndarray, far: np.ndarray, edge: np.ndarray, normal: np.ndarray
+) -> PushCapacity:
+    """Return the capacity of a free body to push its nodes ``far`` against ``normal`` relative to its nodes ``edge``.
+
+    Args:
+        body: the body.
+        muscles: its muscles.
+        positions: (N, 3) m, its nodes.
+        far: (k,) nodes that push.
+        edge: (l,) nodes of the edge about which the body rolls.
+        normal: (3,) unit normal of the ground.
+    """
+    load = np.zeros_like(positions)
+    load[far] -= normal / len(far)
+    load[edge] += normal / len(edge)
+    load -= _rigid_part(body, positions, load)
+    assembly = body.assembly
+    entries = assembly.hessian_entries(positions, projected=True)
+    entries[assembly.diagonal_entries] += _SOFTNESS * entries.max()
+    factors = MultifrontalLdl(assembly.upper_pattern, assembly.analysis)
+    factors.factor(entries)
+    response = factors.solve(load.reshape(-1, 1))[:, 0]
+    stroke = float(np.abs(activation_jacobian(muscles, positions).T @ response) @ muscles.bounds)
+    return PushCapacity(stroke / float(load.ravel() @ response), stroke)
+
+
+def _rigid_part(body: SoftBody, positions: np.ndarray, load: np.ndarray) -> np.ndarray:
+    """Return the inertial forces (N, 3) of the rigid acceleration that ``load`` (N, 3) causes."""
+    arms = positions - body.centre_of_mass(positions)
+    spin = np.linalg.solve(body.inertia(positions), np.cross(arms, load).sum(axis=0))
+    return body.node_mass[:, None] * (load.sum(axis=0) / body.mass + np.cross(spin, arms))
