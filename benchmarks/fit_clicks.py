@@ -6,7 +6,8 @@ one click in each of two annotated photos. The weight of a background supervoxel
 click.
 ``score`` is the overlap (IoU) of the supervoxels, weighted by their blending weight in the judged photos, after the
 first click and after corrections, each of which is in the middle of the largest wrong part. The remaining weights
-(smoothness, colour, opposite, correction, crossing) were chosen by this score, one at a time, on the fitted rooms.
+(smoothness, colour, opposite, correction, crossing, barrier) were chosen by this score, one at a time, on the fitted
+rooms.
 
 With ``--fit``, weights are fitted and printed; without, those of the package are scored. There are no aims.
 """
@@ -26,12 +27,10 @@ from clicking import CLICKED, JUDGED, innermost
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.click_energy import (
     WEIGHTS,
+    ClickScene,
     EnergyWeights,
-    Evidence,
-    evidence_of,
     minimise,
     picture_scale,
-    surface_links,
 )
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.graph_cut import SplatGraph
@@ -104,12 +103,10 @@ def regression(features: np.ndarray, labels: np.ndarray, weights: np.ndarray) ->
     return tuple(float(one) for one in slopes), float(best[-1] - slopes @ mean)
 
 
-def first_evidence(labelled: LabelledScene, click: Click, weights: EnergyWeights) -> tuple[SplatGraph, Evidence]:
-    """Return the links and the evidence of one ``click`` on the object."""
+def click_scene(labelled: LabelledScene, click: Click, weights: EnergyWeights) -> ClickScene:
+    """Return the energy of one ``click`` on the object."""
     scale = picture_scale(click.point, labelled.surface.cameras)
-    links = surface_links(labelled.surface, scale, weights=weights)
-    seeds, nothing = np.unique(labelled.surface.cluster[click.hits]), np.zeros(0, int)
-    return links, evidence_of(labelled.surface, links, seeds, nothing, nothing, labelled.ground, scale, weights=weights)
+    return ClickScene.of(labelled.surface, labelled.ground, scale, weights=weights)
 
 
 def fitted(scenes: Sequence[LabelledScene]) -> EnergyWeights:
@@ -126,9 +123,11 @@ def fitted(scenes: Sequence[LabelledScene]) -> EnergyWeights:
     features, labels, importance = [], [], []
     for labelled in scenes:
         for click in labelled.clicks:
-            _, evidence = first_evidence(labelled, click, weights)
-            own = evidence.area * labelled.truth
-            other = evidence.area * ~labelled.truth * np.exp(-np.exp(evidence.features[:, 0]) / DECAY)
+            scene = click_scene(labelled, click, weights)
+            seeds, nothing = np.unique(labelled.surface.cluster[click.hits]), np.zeros(0, int)
+            evidence = scene.evidence(seeds, nothing, nothing, weights=weights)
+            own = scene.area * labelled.truth
+            other = scene.area * ~labelled.truth * np.exp(-np.exp(evidence.features[:, 0]) / DECAY)
             features.append(evidence.features)
             labels.append(labelled.truth)
             importance.append(own / own.sum() + other / other.sum())
@@ -157,18 +156,17 @@ def correction(labelled: LabelledScene, links: SplatGraph, chosen: np.ndarray) -
 
 def scores(labelled: LabelledScene, click: Click, weights: EnergyWeights, count: int = 3) -> list[float]:
     """Return the overlap after each of ``count`` clicks."""
-    scale = picture_scale(click.point, labelled.surface.cameras)
-    links = surface_links(labelled.surface, scale, weights=weights)
+    scene = click_scene(labelled, click, weights)
     kind = np.zeros(labelled.surface.count, np.int8)
     seeds = np.unique(labelled.surface.cluster[click.hits])
     kind[seeds] = 1
     result: list[float] = []
     for _ in range(count):
         more, others = np.setdiff1d(np.flatnonzero(kind == 1), seeds), np.flatnonzero(kind == -1)
-        evidence = evidence_of(labelled.surface, links, seeds, more, others, labelled.ground, scale, weights=weights)
-        chosen = minimise(labelled.surface, links, evidence, weights=weights)
+        evidence = scene.evidence(seeds, more, others, weights=weights)
+        chosen = minimise(scene, evidence, weights=weights)
         result.append(labelled.iou(chosen))
-        wrong = correction(labelled, links, chosen)
+        wrong = correction(labelled, scene.links, chosen)
         if wrong is not None:
             kind[wrong[0]] = 1 if wrong[1] else -1
     return result

@@ -42,6 +42,8 @@ class EnergyWeights:
     """Factor of the distance from clicks on the object after the first one, which correct smaller parts."""
     crossing: float = 0.1
     """Additional length of a path where it certainly crosses a boundary, in picture radii."""
+    barrier: float = 3.0
+    """The same in the comparison of clicks of both kinds: a click on the ground removes none of a foot on it."""
 
 
 WEIGHTS = EnergyWeights()
@@ -56,7 +58,7 @@ _FOOT = 0.1
 _CLEAR = 5.0
 """Maximum absolute log-odds of a supervoxel."""
 _MAX_WIDTH = 0.1
-"""Maximum width of a Gaussian in the measure of areas and lengths, in picture radii."""
+"""Maximum spacing of Gaussians in the measure of areas and lengths, in picture radii."""
 _BINS, _BLUR, _MAX_COLOUR_RATIO = 12, 0.7, 3.0
 """Bins of a colour channel in the histograms, their blur in bins, and the maximum log-likelihood ratio."""
 _NEARBY = 2.0
@@ -79,8 +81,6 @@ class Evidence:
     """(k,) at least 0, logarithm of the ratio of the surface distances from the clicks on the object and beside it."""
     nearby: np.ndarray
     """(k,) bool, supervoxels that train the colour models."""
-    area: np.ndarray
-    """(k,) area of each supervoxel in squared picture radii."""
 
 
 def picture_scale(point: np.ndarray, cameras: Sequence[Camera]) -> float:
@@ -94,9 +94,92 @@ def boundary_log_odds(surface: SurfaceGraph, weights: EnergyWeights = WEIGHTS) -
     return surface.features.matrix() @ np.array(weights.links) + weights.link_bias
 
 
-def surface_links(surface: SurfaceGraph, scale: float, *, weights: EnergyWeights = WEIGHTS) -> SplatGraph:
-    """Return the links between supervoxels. ``length`` is the length of the path in units of ``scale``, longer where it
-    crosses a boundary or a gap; ``strength`` is the cost of cutting the link."""
+@dataclass(frozen=True)
+class ClickScene:
+    """The part of the energy that all clicks on an object have in common."""
+
+    surface: SurfaceGraph
+    links: SplatGraph
+    """Links between supervoxels. ``length`` is the length of the path in picture radii, longer where it crosses a
+    boundary or a gap; ``strength`` is the cost of cutting the link."""
+    barriers: SplatGraph
+    """The same links, still longer where they cross a boundary."""
+    reach: np.ndarray
+    """(k,) visible half-length of the Gaussians, picture radii."""
+    lying: np.ndarray
+    """(k,) 0 to 1, evidence of lying flat on the ground."""
+    below: np.ndarray
+    """(k,) 0 or 1, whether a supervoxel is below the ground."""
+    off_middle: np.ndarray
+    """(k,) distance from the middle of the photos, picture radii."""
+    outside: np.ndarray
+    """(k,) share of the photos that do not show a supervoxel within a picture radius."""
+    colours: np.ndarray
+    """(k, 3) 0 to 1."""
+    area: np.ndarray
+    """(k,) area of each supervoxel, or, if it is larger, its visible area, in squared picture radii."""
+
+    @classmethod
+    def of(
+        cls, surface: SurfaceGraph, ground: Plane | HeightField, scale: float, *, weights: EnergyWeights = WEIGHTS
+    ) -> ClickScene:
+        """Prepare the energy of ``surface`` above the ``ground``, for an object with the picture radius ``scale``,
+        scene units."""
+        middles, count = surface.middles(), surface.count
+        links, barriers = _links(surface, middles, scale, weights)
+        lengths = np.exp(surface.cloud.log_scales.numpy()[surface.nodes].max(axis=1).astype(np.float64))
+        heights = surface.per_cluster(ground.heights(surface.means[surface.nodes])) / scale
+        level = surface.per_cluster(lies_along(surface.cloud, ground)[surface.nodes].astype(np.float64))
+        off_middle, outside = _framing(middles, surface.cameras)
+        area = np.bincount(surface.own, np.minimum(surface.spacing / scale, _MAX_WIDTH) ** 2, count)
+        visible = np.bincount(surface.cluster, surface.visible_area, count)
+        return cls(
+            surface,
+            links,
+            barriers,
+            _SIGMAS * surface.per_cluster(lengths) / scale,
+            level * np.exp(-np.maximum(heights, 0.0) / _FOOT),
+            (heights < 0.0).astype(np.float64),
+            off_middle,
+            outside,
+            surface.per_cluster(surface.colours),
+            np.maximum(area, visible),
+        )
+
+    def evidence(
+        self, first: np.ndarray, corrections: np.ndarray, others: np.ndarray, *, weights: EnergyWeights = WEIGHTS
+    ) -> Evidence:
+        """Collect the evidence of clicks.
+
+        Args:
+            first: (s,) int, supervoxels that the first click on the object hits.
+            corrections: (c,) int, supervoxels that later clicks on the object hit.
+            others: (t,) int, supervoxels that clicks beside the object hit.
+            weights: the weights of the energy.
+        """
+        paths = _paths(self.links, first)
+        if len(corrections):
+            paths = np.minimum(paths, weights.correction * _paths(self.links, corrections))
+        opposition = np.zeros(self.links.count)
+        if len(others):
+            near, away = (_paths(self.barriers, seeds) for seeds in (np.concatenate([first, corrections]), others))
+            opposition = np.maximum(np.log((near + _NEAREST) / (away + _NEAREST)), 0.0)
+        columns = (
+            np.log(paths + self.reach + _NEAREST),
+            self.lying,
+            self.below,
+            np.maximum(self.off_middle - float(self.off_middle[first].mean()) + self.reach, 0.0),
+            self.outside,
+        )
+        included, excluded = np.zeros((2, self.links.count), bool)
+        included[first], included[corrections], excluded[others] = True, True, True
+        return Evidence(included, excluded, np.stack(columns, axis=1), opposition, paths < _NEARBY)
+
+
+def _links(
+    surface: SurfaceGraph, middles: np.ndarray, scale: float, weights: EnergyWeights
+) -> tuple[SplatGraph, SplatGraph]:
+    """Return ``ClickScene.links`` and ``ClickScene.barriers``."""
     log_odds = boundary_log_odds(surface, weights)
     links, own = surface.links, surface.own
     linked = links.length > 0.0
@@ -111,62 +194,16 @@ def surface_links(surface: SurfaceGraph, scale: float, *, weights: EnergyWeights
     crossed = np.bincount(link, 1.0 / (1.0 + np.exp(-log_odds[between])), len(codes)) / number
     gap = np.full(len(codes), np.inf)
     np.minimum.at(gap, link, unit * surface.features.gap[between])
-    middles = surface.middles()
-    away = np.linalg.norm(middles[first] - middles[second], axis=1)
-    length = (away + _GAP_DETOUR * gap) / scale + weights.crossing * crossed
-    return SplatGraph(surface.count, first, second, length, np.bincount(link, cost[between], len(codes)))
-
-
-def evidence_of(
-    surface: SurfaceGraph,
-    links: SplatGraph,
-    first: np.ndarray,
-    corrections: np.ndarray,
-    others: np.ndarray,
-    ground: Plane | HeightField,
-    scale: float,
-    *,
-    weights: EnergyWeights = WEIGHTS,
-) -> Evidence:
-    """Collect the evidence of clicks.
-
-    Args:
-        surface: the prepared capture.
-        links: its ``surface_links``.
-        first: (s,) int, supervoxels that the first click on the object hits.
-        corrections: (c,) int, supervoxels that later clicks on the object hit.
-        others: (t,) int, supervoxels that clicks beside the object hit.
-        ground: the ground.
-        scale: the picture radius, scene units.
-        weights: the weights of the energy.
-    """
-    paths = _paths(links, first)
-    if len(corrections):
-        paths = np.minimum(paths, weights.correction * _paths(links, corrections))
-    opposition = np.zeros(surface.count)
-    if len(others):
-        opposition = np.maximum(np.log((paths + _NEAREST) / (_paths(links, others) + _NEAREST)), 0.0)
-    lengths = np.exp(surface.cloud.log_scales.numpy()[surface.nodes].max(axis=1).astype(np.float64))
-    reach = _SIGMAS * surface.per_cluster(lengths) / scale
-    heights = surface.per_cluster(ground.heights(surface.means[surface.nodes])) / scale
-    level = surface.per_cluster(lies_along(surface.cloud, ground)[surface.nodes].astype(np.float64))
-    off_middle, outside = _framing(surface, first)
-    columns = (
-        np.log(paths + reach + _NEAREST),
-        level * np.exp(-np.maximum(heights, 0.0) / _FOOT),
-        (heights < 0.0).astype(np.float64),
-        np.maximum(off_middle + reach, 0.0),
-        outside,
+    length = (np.linalg.norm(middles[first] - middles[second], axis=1) + _GAP_DETOUR * gap) / scale
+    strength = np.bincount(link, cost[between], len(codes))
+    paths, barriers = (
+        SplatGraph(surface.count, first, second, length + factor * crossed, strength)
+        for factor in (weights.crossing, weights.barrier)
     )
-    included, excluded = np.zeros((2, surface.count), bool)
-    included[first], included[corrections], excluded[others] = True, True, True
-    area = np.bincount(surface.own, np.minimum(surface.spacing / scale, _MAX_WIDTH) ** 2, surface.count)
-    return Evidence(included, excluded, np.stack(columns, axis=1), opposition, paths < _NEARBY, area)
+    return paths, barriers
 
 
-def minimise(
-    surface: SurfaceGraph, links: SplatGraph, evidence: Evidence, *, weights: EnergyWeights = WEIGHTS
-) -> np.ndarray:
+def minimise(scene: ClickScene, evidence: Evidence, *, weights: EnergyWeights = WEIGHTS) -> np.ndarray:
     """Return (k,) bool, the supervoxels of the object: the minimum of the energy.
 
     Minimum cuts alternate with new colour models of the object and of its surroundings, as in GrabCut (Rother,
@@ -174,24 +211,26 @@ def minimise(
     """
     log_odds = np.clip(evidence.features @ np.array(weights.nodes) + weights.node_bias, -_CLEAR, _CLEAR)
     log_odds = np.clip(log_odds - weights.opposite * evidence.opposition, -_CLEAR, _CLEAR)
-    colours = surface.per_cluster(surface.colours)
-    inside = _cut(links, evidence, log_odds, weights)
+    opposed = evidence.opposition > 0.0
+    inside = _cut(scene, evidence, log_odds, weights)
     for _ in range(_ROUNDS):
-        ratio = _colour_ratio(colours, evidence.area, inside & evidence.nearby, ~inside & evidence.nearby)
-        # Colour is no reason to keep what is nearer to a click beside the object, such as a toy of the same colour.
-        ratio = np.where(evidence.opposition > 0.0, np.minimum(ratio, 0.0), ratio)
-        again = _cut(links, evidence, log_odds + weights.colour * np.where(evidence.nearby, ratio, 0.0), weights)
+        own, other = inside & evidence.nearby, ~inside & evidence.nearby
+        ratio = _colour_ratio(scene.colours, scene.area, own, other)
+        # Colour is no reason to keep what is nearer to a click beside the object and has the colours that it hits.
+        against = np.minimum(ratio, _colour_ratio(scene.colours, scene.area, own, evidence.excluded))
+        ratio = np.where(opposed, against, ratio)
+        again = _cut(scene, evidence, log_odds + weights.colour * np.where(evidence.nearby, ratio, 0.0), weights)
         if (again == inside).all():
             break
         inside = again
     return inside
 
 
-def _cut(links: SplatGraph, evidence: Evidence, log_odds: np.ndarray, weights: EnergyWeights) -> np.ndarray:
+def _cut(scene: ClickScene, evidence: Evidence, log_odds: np.ndarray, weights: EnergyWeights) -> np.ndarray:
     """Return (k,) bool, the minimum cut; scores and costs are scaled to a common range, because they are rounded."""
-    score = evidence.area * log_odds
+    score = scene.area * log_odds
     unit = 1.0 / max(float(np.mean(np.abs(score))), 1e-30)
-    return links.cut(unit * score, evidence.included, evidence.excluded, smoothness=unit * weights.smoothness)
+    return scene.links.cut(unit * score, evidence.included, evidence.excluded, smoothness=unit * weights.smoothness)
 
 
 def _paths(links: SplatGraph, seeds: np.ndarray) -> np.ndarray:
@@ -200,13 +239,11 @@ def _paths(links: SplatGraph, seeds: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(paths), paths, 10.0)
 
 
-def _framing(surface: SurfaceGraph, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (k,), the distance of each supervoxel from the middle of the photos, less the mean distance of the
-    ``seeds``, and (k,), the share of the photos that do not show it within a picture radius. Distances are in picture
-    radii."""
-    radii = np.stack([picture_radii(surface.middles(), camera)[0] for camera in surface.cameras])
-    mean = np.minimum(radii, 2.0).mean(axis=0)
-    return mean - float(mean[seeds].mean()), (radii >= 1.0).mean(axis=0)
+def _framing(middles: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
+    """Return (k,), the distance of each of the ``middles`` (k, 3) from the middle of the photos, picture radii, and
+    (k,), the share of the photos that do not show it within a picture radius."""
+    radii = np.stack([picture_radii(middles, camera)[0] for camera in cameras])
+    return np.minimum(radii, 2.0).mean(axis=0), (radii >= 1.0).mean(axis=0)
 
 
 def _colour_ratio(colours: np.ndarray, area: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.above_plane import SceneAbovePlane
-from egs_warp.segmentation.click_energy import evidence_of, minimise, picture_scale, surface_links
+from egs_warp.segmentation.click_energy import ClickScene, minimise, picture_scale
 from egs_warp.segmentation.clicks import Click
 from egs_warp.segmentation.framing import MIN_PHOTOS, is_in_frame
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -108,10 +108,9 @@ def object_of_clicks(surface: SurfaceGraph, clicks: Sequence[Click], ground: Pla
     own = next(click for click in clicks if click.inside)
     is_first = np.isin(seeds, surface.cluster[own.hits])
     first, corrections = (seeds[is_first], seeds[~is_first]) if is_first.any() else (seeds, seeds[:0])
-    scale = picture_scale(own.point, surface.cameras)
-    links = surface_links(surface, scale)
-    evidence = evidence_of(surface, links, first, corrections, np.flatnonzero(kind == -1), ground, scale)
-    chosen = minimise(surface, links, evidence)[surface.cluster]
+    scene = ClickScene.of(surface, ground, picture_scale(own.point, surface.cameras))
+    evidence = scene.evidence(first, corrections, np.flatnonzero(kind == -1))
+    chosen = minimise(scene, evidence)[surface.cluster]
     for click in clicks:
         chosen[click.hits] = kind[surface.cluster[click.hits]] == 1
     return chosen

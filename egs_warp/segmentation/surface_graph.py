@@ -25,7 +25,10 @@ _NEIGHBOURS = 6
 _MAX_CLUSTERS = 1 << 14
 """Maximum number of supervoxels before supervoxels of several connected components are divided."""
 _VIEWS, _SIDE = 16, 160
-"""Maximum number of photos that orient the normals, and the longer side of their renders, pixels."""
+"""Maximum number of photos that orient the normals and measure visible areas, and the longer side of their renders,
+pixels."""
+_AREA_RATIO = 4.0
+"""Surface area of a convex body relative to its mean silhouette (Cauchy)."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,9 @@ class SurfaceGraph:
     """(n,) int32, supervoxel of each Gaussian; a faint Gaussian has the supervoxel of the nearest opaque one."""
     cameras: tuple[Camera, ...]
     """Cameras of the photos; empty if unknown."""
+    visible_area: np.ndarray
+    """(n,) four times the mean area of each Gaussian in the photos, by blending weight, in squares of half of the
+    shorter side of a photo: on a convex object, its area."""
 
     @property
     def count(self) -> int:
@@ -90,7 +96,8 @@ class SurfaceGraph:
         points = means[nodes]
         colours = np.clip(cloud.sh.numpy()[nodes, 0].astype(np.float64) * SH_BAND_0 + 0.5, 0.0, 1.0)
         links = SplatGraph.of(cloud, nodes, neighbours=_NEIGHBOURS)
-        features = _features(cloud, nodes, links, colours, cameras)
+        towards, visible_area = _sight(cloud, cameras)
+        features = _features(cloud, nodes, links, colours, towards[nodes])
         lengths = np.linalg.norm(points[links.first] - points[links.second], axis=1)
         ends = np.concatenate([links.first, links.second])
         degree = np.bincount(ends, minlength=len(nodes))
@@ -105,7 +112,7 @@ class SurfaceGraph:
         cluster[nodes] = own
         if len(nodes) < len(means):
             cluster[~opaque] = own[KDTree(points).query(means[~opaque])[1]]
-        return cls(cloud, means, nodes, links, features, spacing, colours, cluster, tuple(cameras))
+        return cls(cloud, means, nodes, links, features, spacing, colours, cluster, tuple(cameras), visible_area)
 
     def middles(self) -> np.ndarray:
         """Return the centres (k, 3) of the supervoxels, scene units."""
@@ -120,15 +127,16 @@ class SurfaceGraph:
 
 
 def _features(
-    cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph, colours: np.ndarray, cameras: Sequence[Camera]
+    cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph, colours: np.ndarray, towards: np.ndarray
 ) -> LinkFeatures:
-    """Return the features of the ``links`` between the Gaussians ``nodes`` (m,) with ``colours`` (m, 3)."""
+    """Return the features of the ``links`` between the Gaussians ``nodes`` (m,) with ``colours`` (m, 3), seen from the
+    directions ``towards`` (m, 3)."""
     first, second = links.first, links.second
     points = cloud.means.numpy()[nodes].astype(np.float64)
     contrast = np.linalg.norm(colours[first] - colours[second], axis=1) / links.colour_unit
     arms = points[second] - points[first]
     along = arms / np.maximum(np.linalg.norm(arms, axis=1), 1e-30)[:, None]
-    normals = _outward_normals(cloud, nodes, links, cameras)
+    normals = _outward_normals(cloud, nodes, links, towards)
     bend = np.einsum("ij,ij->i", along, normals[second] - normals[first])
     known = np.linalg.norm(normals, axis=1) > 0.0
     both = known[first] & known[second]
@@ -138,26 +146,32 @@ def _features(
     return LinkFeatures(contrast, np.maximum(-bend, 0.0), np.maximum(bend, 0.0), turn, gap)
 
 
-def _outward_normals(
-    cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph, cameras: Sequence[Camera]
-) -> np.ndarray:
-    """Return the unit normals (m, 3) of the surface at the Gaussians ``nodes`` (m,), on the side from which most of
-    their blending weight in the photos is seen; zero for Gaussians that no photo shows.
-
-    The normal of a Gaussian is its shortest axis. It is averaged with those of its neighbours, with the weight of the
-    Gaussian's flatness and of the squared cosine of the angle, so that creases stay sharp.
-    """
-    towards = np.zeros((cloud.count, 3))
+def _sight(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
+    """Return (n, 3), the direction from which the photos see each Gaussian, by blending weight, zero if none shows it;
+    and (n,), ``SurfaceGraph.visible_area``."""
+    towards, area = np.zeros((cloud.count, 3)), np.zeros(cloud.count)
     means = cloud.means.numpy().astype(np.float64)
-    for camera in cameras[:: -(-len(cameras) // _VIEWS) or 1]:
+    chosen = cameras[:: -(-len(cameras) // _VIEWS) or 1]
+    for camera in chosen:
         small = downscale(camera, _SIDE)
         weights = blending_votes(cloud, [MaskedView(small, np.ones((small.height, small.width), bool))]).inside
         arms = small.centre - means
         towards += (weights / np.maximum(np.linalg.norm(arms, axis=1), 1e-30))[:, None] * arms
+        area += weights * (2.0 / min(small.width, small.height)) ** 2
+    return towards, _AREA_RATIO * area / max(len(chosen), 1)
+
+
+def _outward_normals(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph, towards: np.ndarray) -> np.ndarray:
+    """Return the unit normals (m, 3) of the surface at the Gaussians ``nodes`` (m,), on the side of the direction
+    ``towards`` (m, 3) from which the photos see them; zero for Gaussians that no photo shows.
+
+    The normal of a Gaussian is its shortest axis. It is averaged with those of its neighbours, with the weight of the
+    Gaussian's flatness and of the squared cosine of the angle, so that creases stay sharp.
+    """
     axes = Rotation.from_quat(cloud.rotations.numpy()[nodes], scalar_first=True).as_matrix()
     scales = cloud.log_scales.numpy()[nodes].astype(np.float64)
     normals = axes[np.arange(len(nodes)), :, np.argmin(scales, axis=1)]
-    normals *= np.sign(np.einsum("ij,ij->i", normals, towards[nodes]))[:, None]
+    normals *= np.sign(np.einsum("ij,ij->i", normals, towards))[:, None]
     flatness = 1.0 - np.exp(scales.min(axis=1) - np.sort(scales, axis=1)[:, 1])
     weighted = flatness[:, None] * normals
     agreement = np.maximum(np.einsum("ij,ij->i", normals[links.first], normals[links.second]), 0.0) ** 2
