@@ -9,7 +9,7 @@ import atexit
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import cache
 from queue import SimpleQueue
@@ -110,6 +110,17 @@ def worker_threads() -> WorkerThreads:
     # Compiled code must not be unloaded while a worker runs it.
     atexit.register(workers.end)
     return workers
+
+
+def run_all(tasks: Iterable[Callable[[], T]]) -> list[T]:
+    """Execute the ``tasks`` in the worker threads and in this thread, and return their results in order."""
+    started = [worker_threads().begin(task) for task in tasks]
+    try:
+        return [task.result() for task in started]
+    finally:
+        # After an error, the caller may reuse the memory of the other tasks at once.
+        for task in started:
+            task.wait()
 
 
 if hasattr(os, "register_at_fork"):

@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-from egs_warp.worker_threads import Task, WorkerThreads, worker_threads
+from egs_warp.worker_threads import Task, WorkerThreads, run_all, worker_threads
 
 BUSY = """
 import sys, time
@@ -35,6 +35,27 @@ def test_each_task_is_done_once() -> None:
     assert threading.active_count() <= before + 2
     many.end()
     assert threading.active_count() == before
+
+
+def test_all_results_are_in_order_and_nothing_runs_after_an_error() -> None:
+    """The caller of tasks of which one fails may reuse their memory: the others have ended or never start."""
+    assert run_all([lambda number=number: number**2 for number in range(100)]) == [n**2 for n in range(100)]
+    running, done = threading.Event(), []
+
+    def slow() -> None:
+        running.set()
+        time.sleep(0.05)
+        done.append(1)
+
+    def failing() -> None:
+        running.wait(10.0)
+        raise ValueError("one task fails")
+
+    with pytest.raises(ValueError, match="one task fails"):
+        run_all([slow, failing, slow])
+    ended = len(done)
+    time.sleep(0.2)
+    assert ended == len(done) >= 1
 
 
 def test_tasks_run_concurrently() -> None:

@@ -6,7 +6,9 @@ numerically in a world, the host repeats the search of this world.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -32,6 +34,7 @@ from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import RESTART_COST, RESTART_GAP
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.precision import Vec3, real
+from egs_warp.worker_threads import run_all
 
 POOL, RELAXATION_POOL = 512, 256
 """Maximum number of worlds in a launch of the search, and in a launch that computes relaxed optima."""
@@ -172,22 +175,18 @@ class BatchModeSearch:
         result = packed.new_zeros(len(packed), HEADER_SIZE + self._m + 3 * self._capacity)
         unused = torch.zeros((len(packed), 1), dtype=torch.int32, device=packed.device)
         self._first.run(as_warp(packed, real), as_warp(result, real), as_warp(unused, wp.int32))
-        # With many threads, BLAS takes ten times as long for matrices of this size.
-        with one_blas_thread():
-            for world in nonzero(result[:, _STATUS] == NUMERICAL_FAILURE).tolist():
-                self._search_on_host(packed[world], result[world])
+        _repeat_on_host(packed, result, self._search_on_host)
         return result
 
-    def _search_on_host(self, packed: torch.Tensor, result: torch.Tensor) -> None:
-        """Repeat a search on the host. The ``result`` stays a numerical failure if the QP is not finite."""
-        program, start, modes = parse_packed_qp(packed.cpu().numpy())
+    def _search_on_host(self, packed: np.ndarray) -> np.ndarray | None:
+        """Return the packed result of the search for one ``packed`` QP; None if the QP is not finite."""
+        program, start, modes = parse_packed_qp(packed)
         if not (np.isfinite(program.P).all() and np.isfinite(program.rows).all()):
-            return
+            return None
         found = search_modes(program, start, modes, qp_limit=self._limit, solver=QpSolver.OSQP)
-        header = [float(OPTIMUM_FOUND), found.qp_count, found.infeasible, found.objective, float(found.x is not None)]
-        result[:5] = torch.tensor(header, dtype=torch.float64)
-        if found.x is not None:
-            result[HEADER_SIZE : HEADER_SIZE + len(found.x)] = torch.from_numpy(found.x)
+        header = np.zeros(HEADER_SIZE)
+        header[:5] = OPTIMUM_FOUND, found.qp_count, found.infeasible, found.objective, found.x is not None
+        return header if found.x is None else np.concatenate([header, found.x])
 
     def _relax(self, program: BatchProgram) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Compute the relaxed optimum of each world (``contact_modes.solve_relaxed``).
@@ -199,14 +198,8 @@ class BatchModeSearch:
         packed = program.packed
         result = packed.new_zeros(len(packed), HEADER_SIZE + self._m)
         self._relaxed.run(as_warp(packed, real), as_warp(result, real))
-        is_known = result[:, _STATUS] == OPTIMUM_FOUND
-        with one_blas_thread():
-            for world in nonzero(~is_known).tolist():
-                relaxed = solve_relaxed(parse_packed_qp(packed[world].cpu().numpy())[0], QpSolver.OSQP)
-                if relaxed is not None:
-                    result[world, HEADER_SIZE:], result[world, 1] = torch.from_numpy(relaxed[0]), relaxed[1]
-                    is_known[world] = True
-        return result[:, HEADER_SIZE:], result[:, 1], is_known
+        _repeat_on_host(packed, result, _relax_on_host)
+        return result[:, HEADER_SIZE:], result[:, 1], result[:, _STATUS] == OPTIMUM_FOUND
 
     def _search_from(self, program: BatchProgram, activations: torch.Tensor) -> torch.Tensor:
         """Search again in each world, starting from ``activations`` (c, m) and the contact forces that they cause."""
@@ -220,6 +213,39 @@ class BatchModeSearch:
             outputs=[(packed, real)],
         )
         return self._run(packed)
+
+
+def _repeat_on_host(
+    packed: torch.Tensor, result: torch.Tensor, repeat: Callable[[np.ndarray], np.ndarray | None]
+) -> None:
+    """Replace the results of numerical failures by results of the host, computed in parallel.
+
+    Args:
+        packed: (c, ...) packed QP of each world.
+        result: (c, ...) packed results. Failures for which ``repeat`` returns None stay failures.
+        repeat: function of the packed QP of a world that returns the packed result, without trailing zeros.
+    """
+    worlds = nonzero(result[:, _STATUS] != OPTIMUM_FOUND)
+    if len(worlds) == 0:
+        return
+    inputs = packed[worlds].cpu().numpy()
+    # With more threads for each world, BLAS takes ten times as long for matrices of this size.
+    with one_blas_thread():
+        found = run_all(partial(repeat, each) for each in inputs)
+    for world, each in zip(worlds.tolist(), found, strict=True):
+        if each is not None:
+            result[world, : len(each)] = torch.from_numpy(each).to(result.device)
+
+
+def _relax_on_host(packed: np.ndarray) -> np.ndarray | None:
+    """Return the packed result of the relaxed problem for one ``packed`` QP; None without a solution."""
+    relaxed = solve_relaxed(parse_packed_qp(packed)[0], QpSolver.OSQP)
+    if relaxed is None:
+        return None
+    activations, objective = relaxed
+    header = np.zeros(HEADER_SIZE)
+    header[:2] = OPTIMUM_FOUND, objective
+    return np.concatenate([header, activations])
 
 
 def points_of(result: torch.Tensor, counts: torch.Tensor, m: int, capacity: int) -> torch.Tensor:

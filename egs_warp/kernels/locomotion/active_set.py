@@ -39,6 +39,8 @@ DEPENDENCE_TOLERANCE = wp.constant(real(1e-9))
 """A row depends on the active rows if the squared length of its part orthogonal to them is below this."""
 PIVOTS = wp.constant(600)
 """Maximum number of dual iterations."""
+RESTARTS = wp.constant(8)
+"""Maximum number of restarts if rounding leaves a violated row or a multiplier of the wrong sign."""
 _CHECK_INTERVAL = wp.constant(8)
 """Number of dual iterations between two checks of the cost limit and of cancellation."""
 
@@ -71,10 +73,9 @@ class UnitConstraints:
     """(m,) amount by which a row may violate its bounds."""
     cost_limit: real
     """Cost z^T z / 2 above which the problem is treated as infeasible."""
-    restarts: int
-    """Maximum number of restarts if rounding leaves a violated row or a multiplier of the wrong sign. If it is not 0,
-    the part of a row that is orthogonal to the active rows is orthogonalised twice, which removes the error of the
-    first pass."""
+    orthogonalizations: int
+    """1 to compute the part of an entering row that is orthogonal to the active rows once, 2 to orthogonalise it again,
+    which removes the error of the first pass. Restarts always use 2."""
     cancelled: wp.array[int]
     """(1,) nonzero once the result is no longer needed."""
 
@@ -199,24 +200,26 @@ def write_inverse(state: ActiveSet, count: int):
 
 
 @wp.func
-def drop_wrong_sign(rows: UnitConstraints, state: ActiveSet, count: int):
-    """Deactivate rows whose multiplier has the wrong sign or whose value is not at its bound; return their number."""
+def count_wrong_rows(rows: UnitConstraints, state: ActiveSet, count: int, deactivate: int):
+    """Return the number of active rows whose multiplier has the wrong sign or whose value is not at its bound, and
+    deactivate them if ``deactivate`` is 1."""
     lane = lane_of_block()
     most = real(0.0)
     for i in range(lane, count, wp.block_dim()):
         most = wp.max(most, wp.abs(state.multipliers[i]))
     most = block_max(most)
     sync_block()
-    dropped = real(0.0)
+    wrong = real(0.0)
     for i in range(lane, count, wp.block_dim()):
         row = state.active[i]
         residual = wp.abs(state.values[row] - bound_of(rows, state, row))
         if state.multipliers[i] < -WRONG_SIGN_TOLERANCE * most or residual > BOUND_TOLERANCE + rows.slack[row]:
-            state.side[row] = 0
-            dropped += real(1.0)
-    dropped = sum_of_block(dropped)
+            wrong += real(1.0)
+            if deactivate == 1:
+                state.side[row] = 0
+    wrong = sum_of_block(wrong)
     sync_block()
-    return int(dropped)
+    return int(wrong)
 
 
 @wp.func
@@ -272,7 +275,7 @@ def find_directions(rows: UnitConstraints, state: ActiveSet, count: int, directi
     for c in range(lane, rows.unknowns, wp.block_dim()):
         state.orthogonal_part[c] = state.entering_row[c] - state.orthogonal_part[c]
     sync_block()
-    if rows.restarts > 0:
+    if rows.orthogonalizations > 1:
         # Orthogonalise again, because rounding has left a part along the active rows.
         multiply(state.active_rows, count, rows.unknowns, state.orthogonal_part, state.scratch_a)
         multiply(state.inverse, count, count, state.scratch_a, state.scratch_b)
@@ -420,9 +423,11 @@ def dual_iterations(rows: UnitConstraints, state: ActiveSet, active: int):
     """Run the dual iterations from a dual feasible active set, adding the most violated row first.
 
     Returns: number of active rows at the optimum; -1 if the problem is infeasible or exceeds the cost limit; -2 on
-    numerical failure, on cancellation, or after ``PIVOTS`` iterations.
+    numerical failure, on cancellation, or after ``PIVOTS`` iterations. It is a numerical failure if the cost, which
+    each added row raises, does not rise.
     """
     count = int(active)
+    last_cost = real(-1.0)
     write_inverse(state, count)
     for number in range(PIVOTS):
         row = most_violated(rows, state)
@@ -432,8 +437,12 @@ def dual_iterations(rows: UnitConstraints, state: ActiveSet, active: int):
         if count < 0:
             return count
         if number % _CHECK_INTERVAL == 0:
-            if cost_of(rows, state) > rows.cost_limit:
+            cost = cost_of(rows, state)
+            if cost > rows.cost_limit:
                 return -1
+            if not cost > last_cost:
+                return -2
+            last_cost = cost
             if is_cancelled(rows):
                 return -2
     return -2
@@ -462,15 +471,16 @@ def refine(rows: UnitConstraints, state: ActiveSet, count: int):
 def find_optimum(rows: UnitConstraints, state: ActiveSet):
     """Solve from the guessed sides ``state.side``; return the status.
 
-    Guessed rows with multipliers of the wrong sign are dropped, then violated rows are added one at a time. Rounding
-    may leave a violated row or a multiplier of the wrong sign at the end, or make the problem appear infeasible. In
-    these cases the search is restarted from the active rows, without the accumulated rounding errors, up to
-    ``rows.restarts`` times. The mode search uses no restarts: none was necessary in 3,459 recorded mode regions. Only
-    12 of 1,025 relaxed problems failed without restarts; with restarts, these 12 took five times as long, and four of
-    them still did not converge.
+    Guessed rows with multipliers of the wrong sign are dropped, then violated rows are added one at a time. If rows
+    were added that almost depend on each other, the updated inverse has large errors, even after these rows have been
+    dropped. The iterations may then fail, leave violated rows or multipliers of the wrong sign, or make the problem
+    appear infeasible. In these cases the search is restarted, up to ``RESTARTS`` times, from all active rows, with a
+    new inverse.
     """
     was_infeasible = int(0)
-    for restart in range(rows.restarts + 1):
+    restart = int(0)
+    # Warp would unroll a range loop.
+    while restart <= RESTARTS:
         count = int(0)
         dropped = int(1)
         while dropped > 0:
@@ -480,15 +490,18 @@ def find_optimum(rows: UnitConstraints, state: ActiveSet):
             if count < 0:
                 clear_active_set(rows, state)
             else:
-                dropped = drop_wrong_sign(rows, state, count)
+                if restart > 0:
+                    write_inverse(state, count)
+                    refine(rows, state, count)
+                dropped = count_wrong_rows(rows, state, count, 1)
         count = dual_iterations(rows, state, count)
-        if count == -1 and (was_infeasible == 1 or restart == rows.restarts):
+        if count == -1 and (was_infeasible == 1 or restart == RESTARTS):
             return INFEASIBLE
-        if count == -2:
-            return NUMERICAL_FAILURE
         was_infeasible = wp.where(count == -1, 1, 0)
         if count >= 0:
             refine(rows, state, count)
-            if drop_wrong_sign(rows, state, count) == 0 and most_violated(rows, state) < 0:
+            if count_wrong_rows(rows, state, count, 0) == 0 and most_violated(rows, state) < 0:
                 return OPTIMUM_FOUND
+        restart += 1
+        rows.orthogonalizations = 2
     return NUMERICAL_FAILURE

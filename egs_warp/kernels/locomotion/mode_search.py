@@ -272,6 +272,7 @@ def solve_mode_region(
     rows.count = m + mode_rows
     rows.base_count = m + map_rows
     rows.cost_limit = INFEASIBLE_COST * objective_drop
+    rows.orthogonalizations = 1
     active_count = int(0)
     solved.ended = OPTIMUM_FOUND
     if crash_start(rows, state) > 0:

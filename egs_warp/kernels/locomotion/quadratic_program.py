@@ -11,8 +11,6 @@ from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
 
-_RESTARTS = wp.constant(3)
-
 
 @wp.kernel
 def optimum_kernel(
@@ -34,6 +32,6 @@ def optimum_kernel(
     rows.count = count
     rows.base_count = count
     rows.cost_limit = cost_limit
-    rows.restarts = _RESTARTS
+    rows.orthogonalizations = 2
     ended[0] = find_optimum(rows, state)
     ended[1] = compact_indices(state.side, count, 0, state.active)

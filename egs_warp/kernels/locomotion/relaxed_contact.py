@@ -240,6 +240,7 @@ def relax(
         rows.count = program.m + (1 + _ROWS_PER_FORCE) * program.n
         rows.base_count = program.n + size
         rows.cost_limit = INFEASIBLE_COST * objective_drop
+        rows.orthogonalizations = 1
         write_rows(program, relaxed, rows, splitting.initial_values)
         ended = OPTIMUM_FOUND
         for k in range(lane, size, wp.block_dim()):
