@@ -44,8 +44,9 @@ from egs_warp.io import read_capture
 from egs_warp.io.video import contact_sheet
 from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
-from egs_warp.training.finetune import FinetuneOptions, TrainingView, finetune
+from egs_warp.training.finetune import FinetuneOptions, finetune
 from egs_warp.training.metrics import psnr
+from egs_warp.training.training_view import TrainingView
 from floor_measures import coarse_psnr, gradient_energy, moved_floor_scores, similarity
 from harness import Row, Table, data_folder, flags, report, timed
 

@@ -14,7 +14,8 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.precision import Vec3
-from egs_warp.training.finetune import Densification, FinetuneOptions, TrainingView, finetune
+from egs_warp.training.finetune import Densification, FinetuneOptions, finetune
+from egs_warp.training.training_view import TrainingView
 from kernels import trace_kernel
 from painted_meshes import PaintedMesh
 

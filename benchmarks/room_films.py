@@ -38,8 +38,8 @@ from egs_warp.pipelines.segmentation_warnings import segmentation_warnings
 from egs_warp.pipelines.simulated_run import simulate
 from egs_warp.pipelines.train_capture import train
 from egs_warp.segmentation.object_spec import ObjectSpec
-from egs_warp.training.finetune import TrainingView
 from egs_warp.training.photo_colours import photographs_in_colours_of
+from egs_warp.training.training_view import TrainingView
 from harness import Row, data_folder, timed
 
 CLICKS = 3

@@ -23,8 +23,8 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.meshing.cage import build_cage
 from egs_warp.render import render_gaussians
-from egs_warp.training.finetune import TrainingView
 from egs_warp.training.metrics import psnr, ssim
+from egs_warp.training.training_view import TrainingView
 from harness import Row, Table, timed
 from painted_meshes import PaintedMesh
 from perceptual import flip_error, lpips_distance

@@ -13,9 +13,9 @@ from scipy.spatial import KDTree
 
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.colmap import SparsePoints
-from egs_warp.training.finetune import TrainingView
 from egs_warp.training.initial_cloud import middle_of
 from egs_warp.training.metrics import ssim
+from egs_warp.training.training_view import TrainingView
 
 _RATES = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
 _FIRST_OPACITY, _FIRST_SCALE = 0.5, 0.1

@@ -67,15 +67,9 @@ if TYPE_CHECKING:
     from egs_warp.segmentation.clicks import Click, click_at
     from egs_warp.segmentation.object_spec import Box, ObjectSpec
     from egs_warp.segmentation.votes import MaskedView
-    from egs_warp.training.finetune import (
-        Densification,
-        FinetuneOptions,
-        LearningRates,
-        TrainingView,
-        finetune,
-        render_views,
-    )
+    from egs_warp.training.finetune import Densification, FinetuneOptions, LearningRates, finetune, render_views
     from egs_warp.training.metrics import psnr
+    from egs_warp.training.training_view import TrainingView
     from egs_warp.web.notebook import show
 
 _MODULES: dict[str, tuple[str, ...]] = {
@@ -134,15 +128,9 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "segmentation.clicks": ("Click", "click_at"),
     "segmentation.object_spec": ("Box", "ObjectSpec"),
     "segmentation.votes": ("MaskedView",),
-    "training.finetune": (
-        "Densification",
-        "FinetuneOptions",
-        "LearningRates",
-        "TrainingView",
-        "finetune",
-        "render_views",
-    ),
+    "training.finetune": ("Densification", "FinetuneOptions", "LearningRates", "finetune", "render_views"),
     "training.metrics": ("psnr",),
+    "training.training_view": ("TrainingView",),
     "web.notebook": ("show",),
 }
 """Module of each public name; the imports above declare the same for type checkers."""

@@ -64,21 +64,23 @@ class Camera:
         )
 
 
-def downscale(camera: Camera, side: int) -> Camera:
-    """Return the same view with both sides divided by the smallest integer that makes them at most ``side`` pixels."""
-    factor = -(-max(camera.width, camera.height) // side)
-    if factor <= 1:
-        return camera
-    width, height = max(camera.width // factor, 1), max(camera.height // factor, 1)
+def reduced_camera(camera: Camera, factor: int) -> Camera:
+    """Return the same view with both sides divided by ``factor``, rounded down to at least one pixel."""
     return replace(
         camera,
-        width=width,
-        height=height,
+        width=max(camera.width // factor, 1),
+        height=max(camera.height // factor, 1),
         fx=camera.fx / factor,
         fy=camera.fy / factor,
         cx=camera.cx / factor,
         cy=camera.cy / factor,
     )
+
+
+def downscale(camera: Camera, side: int) -> Camera:
+    """Return the same view with both sides divided by the smallest integer that makes them at most ``side`` pixels."""
+    factor = -(-max(camera.width, camera.height) // side)
+    return camera if factor <= 1 else reduced_camera(camera, factor)
 
 
 def fitted_camera(camera: Camera, points: np.ndarray, *, sides: float, top: float, bottom: float) -> Camera:

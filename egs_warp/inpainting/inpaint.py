@@ -340,7 +340,8 @@ def _trained(
     """Train ``new`` against the inpainted picture, together with the floor around the hole. The result has SH degree
     0."""
     try:
-        from egs_warp.training.finetune import FinetuneOptions, GaussianTensors, LearningRates, TrainingView, finetune
+        from egs_warp.training.finetune import FinetuneOptions, GaussianTensors, LearningRates, finetune
+        from egs_warp.training.training_view import TrainingView
     except ImportError as error:
         advice = "training needs PyTorch; install egs-warp[torch] or give 0"
         raise ArgumentError("steps", advice, value=options.steps) from error

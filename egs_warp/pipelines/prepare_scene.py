@@ -33,7 +33,7 @@ from egs_warp.training import has_torch
 
 if TYPE_CHECKING:
     from egs_warp.inpainting.inpainters import Inpainter
-    from egs_warp.training.finetune import TrainingView
+    from egs_warp.training.training_view import TrainingView
 
 _CLEARED = {
     StraddlingPolicy.NONE: "left as they are",

@@ -16,11 +16,12 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import read_points
 from egs_warp.io.posed_images import ExcludedPhoto
 from egs_warp.render import render_gaussians
-from egs_warp.training.finetune import Densification, FinetuneOptions, TrainingView, finetune
+from egs_warp.training.finetune import Densification, FinetuneOptions, finetune
 from egs_warp.training.initial_cloud import MIN_POINTS, cloud_from_points, initial_cloud
 from egs_warp.training.metrics import match_tone, psnr, ssim_of
 from egs_warp.training.outlier_views import is_outlier
 from egs_warp.training.posed_photos import PhotoSources, backdrop_colour, laid_over, read_views
+from egs_warp.training.training_view import TrainingView
 
 _HOLD_OUT_EVERY = 8
 """Interval of the held-out photos: every eighth photo is used for evaluation and not for training, as is common in

@@ -28,7 +28,8 @@ from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 
 if TYPE_CHECKING:
-    from egs_warp.training.finetune import GaussianTensors, TrainingView
+    from egs_warp.training.finetune import GaussianTensors
+    from egs_warp.training.training_view import TrainingView
 
 GAMMA = 3.0
 """Extent of a Gaussian in standard deviations, as in Eq. (3)."""
@@ -198,7 +199,7 @@ def half_space(cloud: GaussianCloud, plane: Plane, chosen: np.ndarray) -> Gaussi
 def views_above(cloud: GaussianCloud, plane: Plane, cameras: Sequence[Camera]) -> list[TrainingView]:
     """Render ``cloud`` alone. The valid pixels are those that show something above the plane and those that show
     nothing."""
-    from egs_warp.training.finetune import TrainingView
+    from egs_warp.training.training_view import TrainingView
 
     views = []
     for camera in cameras:

@@ -26,6 +26,8 @@ from egs_warp.training.metrics import ssim
 from egs_warp.training.outlier_views import OutlierViews
 from egs_warp.training.photo_loss import PhotoLoss, Target
 from egs_warp.training.relocation import Population
+from egs_warp.training.resolution import ResolutionSchedule
+from egs_warp.training.training_view import TrainingView
 
 MIN_LOG_SCALE = -10.0
 """Minimum log scale: scales are at least e^-10, as in the paper."""
@@ -40,21 +42,6 @@ class Densification(enum.Enum):
     """The number and order of Gaussians do not change."""
     RELOCATION = "relocation"
     """Faint Gaussians move to opaque ones, the number grows to a cap, and means are perturbed by noise (MCMC)."""
-
-
-@dataclass(frozen=True)
-class TrainingView:
-    """One picture to be matched."""
-
-    camera: Camera
-    image: np.ndarray
-    """(H, W, 3) float32, 0 to 1, display-referred."""
-    alpha: np.ndarray | None = None
-    """(H, W) float32; if given, ``image`` is not yet composited over a background."""
-    weight: np.ndarray | None = None
-    """(H, W) float32, nonnegative weight of each pixel in the L1 loss; None weights all pixels equally."""
-    name: str = ""
-    """Name of the photo, for messages."""
 
 
 @dataclass(frozen=True)
@@ -170,9 +157,12 @@ def finetune(
     relocating = options.densification is Densification.RELOCATION
     cameras = [view.camera for view in views]
     extent = cameras_extent(cameras) if relocating else scene_extent(cameras, cloud)
-    population = Population(_tensors(cloud, device), vars(options.rates), extent=extent, generator=generator)
+    population = Population(
+        *(_tensors(cloud, device), vars(options.rates)), extent=extent, generator=generator, threads=options.threads
+    )
     frozen = None if trainable is None else torch.as_tensor(~np.asarray(trainable, bool), device=device)
-    targets = [_target(view, device) for view in views]
+    resolution = ResolutionSchedule(views, options.iterations if relocating else 0)
+    pictures = {factor: [_picture(view.reduced(factor), device) for view in views] for factor in resolution.factors}
     tones = ExposureModel(len(views), options.iterations, device) if options.fit_exposure else None
     photo_loss = PhotoLoss(options.ssim_weight, device, options.threads)
     outlier_views = OutlierViews(len(views))
@@ -197,7 +187,10 @@ def finetune(
             fitting = [number for number in range(len(views)) if number not in outlier_views.indices]
             queue = [fitting[i] for i in order.permutation(len(fitting))]
         number = queue.pop()
-        target = targets[number]
+        factor = resolution.factor(step)
+        if factor != resolution.factor(max(step - 1, 0)):
+            growth.restart()
+        camera, target = pictures[factor][number]
         background = options.background
         if background is None:
             background = tuple(torch.rand(3, generator=generator, device=device).tolist())
@@ -208,7 +201,7 @@ def finetune(
         image = render_torch(
             *(tensors.means, tensors.rotations, tensors.log_scales, tensors.opacity_logits),
             torch.cat([tensors.sh_band_0, bands], dim=1),
-            views[number].camera,
+            camera,
             background=background,
             antialiased=antialiased,
             threads=options.threads,
@@ -314,13 +307,13 @@ def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
     return min(candidates) if candidates else 1.0
 
 
-def _target(view: TrainingView, device: str) -> Target:
+def _picture(view: TrainingView, device: str) -> tuple[Camera, Target]:
     def upload(values: np.ndarray | None) -> torch.Tensor | None:
         return None if values is None else torch.as_tensor(values, dtype=torch.float32, device=device).contiguous()
 
     image = upload(view.image)
     assert image is not None
-    return Target(image, upload(view.alpha), upload(view.weight))
+    return view.camera, Target(image, upload(view.alpha), upload(view.weight))
 
 
 def _loss(target: Target, picture: torch.Tensor, background: Sequence[float], ssim_weight: float) -> torch.Tensor:

@@ -48,6 +48,11 @@ class Growth:
         if self._idle >= _WINDOWS:
             self.cap = min(self.cap, count)
 
+    def restart(self) -> None:
+        """Forget the recorded losses, which cannot be compared with the next ones."""
+        self._losses.clear()
+        self.history.clear()
+
     def state(self) -> State:
         """Return the state for a checkpoint."""
         return {"cap": self.cap, "history": self.history, "recent": self._losses, "idle": self._idle}

@@ -15,7 +15,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.colmap import SparsePoints
-from egs_warp.training.finetune import TrainingView
+from egs_warp.training.training_view import TrainingView
 
 MIN_POINTS = 500
 """Minimum number of triangulated points from which a training starts."""

@@ -17,7 +17,7 @@ from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.training import has_torch
 
 if TYPE_CHECKING:
-    from egs_warp.training.finetune import TrainingView
+    from egs_warp.training.training_view import TrainingView
 
 _PHOTO_SIDE = 320
 """Longer side of a photo in pixels: enough for the few Gaussians at an object's foot."""
@@ -35,7 +35,7 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
     ``cloud``. The list is empty without PyTorch."""
     if not has_torch():
         return []
-    from egs_warp.training.finetune import TrainingView
+    from egs_warp.training.training_view import TrainingView
 
     views = []
     for one in posed:

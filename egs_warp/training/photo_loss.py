@@ -1,4 +1,4 @@
-"""Loss of a render against a photo, at the photo's exposure: L1 and SSIM, and their gradient, in five kernel launches.
+"""Loss of a render against a photo, at the photo's exposure: L1 and SSIM, and their gradient, in six kernel launches.
 
 The kernels are in ``egs_warp/kernels/training/photo_loss.py``.
 """
@@ -11,20 +11,17 @@ from typing import Any
 import torch
 import warp as wp
 
-from egs_warp.kernels.training.photo_loss import (
-    blur_derivatives_kernel,
-    blur_products_kernel,
-    gradient_kernel,
-    similarity_kernel,
-    tone_kernel,
-)
+from egs_warp.kernels.training import ssim_cpu, ssim_cuda
+from egs_warp.kernels.training.photo_loss import gradient_kernel, tone_kernel
+from egs_warp.kernels.training.ssim import PADDING, REACH
 from egs_warp.launching import launch_rows
 from egs_warp.render.autograd import torch_stream
 
-_PICTURES = (
-    *("toned", "photo", "front", "mean_a", "mean_b", "aa", "bb", "ab"),
-    *("by_mean", "by_square", "by_product", "by_mean_rows", "by_square_rows", "by_product_rows", "by_toned"),
+_PADDED = (
+    *("toned", "photo", "mean_a", "mean_b", "aa", "bb", "ab", "similarity"),
+    *("by_mean", "by_square", "by_product", "by_mean_rows", "by_square_rows", "by_product_rows", "by_similarity"),
 )
+"""Names of the images with padded rows."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +46,7 @@ class PhotoLoss:
         line = torch.exp(-(torch.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
         self.window = (line / line.sum()).to(device)
         self._none = torch.zeros((1, 3), device=device)
-        self._scratch: dict[int, dict[str, torch.Tensor]] = {}
+        self._scratch: dict[tuple[int, int], dict[str, torch.Tensor]] = {}
 
     def __call__(
         self,
@@ -73,14 +70,23 @@ class PhotoLoss:
         """
         return _Loss.apply(colour, alpha, tone, target, backdrop, self)  # type: ignore[return-value]
 
-    def scratch(self, pixels: int) -> dict[str, torch.Tensor]:
-        """Return the buffers, by name, for pictures of ``pixels`` pixels."""
-        if pixels not in self._scratch:
+    def scratch(self, height: int, width: int) -> dict[str, torch.Tensor]:
+        """Return the buffers, by name, for images of ``height`` x ``width`` pixels."""
+        if (height, width) not in self._scratch:
             device = self.window.device
-            self._scratch[pixels] = {name: torch.empty((pixels, 3), device=device) for name in _PICTURES} | {
-                name: torch.empty(pixels, device=device) for name in ("off", "loss")
+            pixels, padded = height * width, PADDING + (height + 2 * REACH) * self.pitch(width)
+            self._scratch[height, width] = {
+                # The kernels write no padding, so it remains zero.
+                **{name: torch.zeros(padded, device=device) for name in _PADDED},
+                **{name: torch.empty((pixels, 3), device=device) for name in ("front", "by_toned")},
+                "off": torch.empty(pixels, device=device),
             }
-        return self._scratch[pixels]
+        return self._scratch[height, width]
+
+    @staticmethod
+    def pitch(width: int) -> int:
+        """Return the number of floats in a padded row of ``width`` pixels, a multiple of ``PADDING``."""
+        return -(-(3 * width + PADDING) // PADDING) * PADDING
 
     @property
     def nothing(self) -> torch.Tensor:
@@ -103,7 +109,7 @@ class _Loss(torch.autograd.Function):
         pixels = height * width
         cut_out = int(target.alpha is not None)
         device = wp.device_from_torch(colour.device)
-        buffers = task.scratch(pixels)
+        buffers = task.scratch(height, width)
         tone = tone.detach().contiguous()
         by_colour = torch.empty((pixels, 3), device=colour.device)
         by_alpha = torch.empty(pixels if cut_out else 1, device=colour.device)
@@ -122,51 +128,41 @@ class _Loss(torch.autograd.Function):
             else wp.array(ptr=task.nothing.data_ptr(), dtype=wp.float32, shape=(1,), device=device)
         )
         colour, alpha = colour.detach().contiguous(), alpha.detach().contiguous()
-        options = {"device": device, "threads": task.threads}
-        w = task.ssim_weight
+        w, pitch = task.ssim_weight, task.pitch(width)
+        kernels = (ssim_cpu if device.is_cpu else ssim_cuda).KERNELS
+        blocks = -(-3 * width // kernels.lanes)
+        products = [at[name] for name in ("mean_a", "mean_b", "aa", "bb", "ab")]
+        derivatives = [at[name] for name in ("by_mean", "by_square", "by_product")]
+        rows = [at[name] for name in ("by_mean_rows", "by_square_rows", "by_product_rows")]
+
+        def launch(kernel: Any, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+            launch_rows(kernel, count, inputs=inputs, outputs=outputs, device=device, threads=task.threads)
+
         with torch_stream(colour.device):
-            launch_rows(
+            launch(
                 tone_kernel,
                 pixels,
-                inputs=[
-                    *(cut_out, backdrops, tones, of(colour), of(alpha, wp.float32)),
+                [
+                    *(width, pitch, cut_out, backdrops, tones, of(colour), of(alpha, wp.float32)),
                     *(of(target.image), of(target.alpha, wp.float32), weight),
                 ],
-                outputs=[at["toned"], at["photo"], at["front"], at["off"]],
-                **options,
+                [at["toned"], at["photo"], at["front"], at["off"]],
             )
-            launch_rows(
-                blur_products_kernel,
-                pixels,
-                inputs=[width, window, at["toned"], at["photo"]],
-                outputs=[at["mean_a"], at["mean_b"], at["aa"], at["bb"], at["ab"]],
-                **options,
+            count, images = height * blocks, [at["toned"], at["photo"]]
+            launch(kernels.blur_products, count, [blocks, pitch, window, *images], products)
+            launch(
+                kernels.similarity,
+                count,
+                [blocks, pitch, width, window, *products],
+                [at["similarity"], *derivatives],
             )
-            launch_rows(
-                similarity_kernel,
-                pixels,
-                inputs=[
-                    *(width, height, w, window, at["mean_a"], at["mean_b"], at["aa"], at["bb"], at["ab"], at["off"])
-                ],
-                outputs=[at["loss"], at["by_mean"], at["by_square"], at["by_product"]],
-                **options,
-            )
-            launch_rows(
-                blur_derivatives_kernel,
-                pixels,
-                inputs=[width, window, at["by_mean"], at["by_square"], at["by_product"]],
-                outputs=[at["by_mean_rows"], at["by_square_rows"], at["by_product_rows"]],
-                **options,
-            )
-            launch_rows(
+            launch(kernels.blur_derivatives, count, [blocks, pitch, window, *derivatives], rows)
+            launch(kernels.gradient, count, [blocks, pitch, window, *images, *rows], [at["by_similarity"]])
+            launch(
                 gradient_kernel,
                 pixels,
-                inputs=[
-                    *(width, height, w, cut_out, window, backdrops, tones, weight, at["toned"], at["photo"]),
-                    *(at["by_mean_rows"], at["by_square_rows"], at["by_product_rows"]),
-                ],
-                outputs=[at["by_toned"], of(by_colour), of(by_alpha, wp.float32)],
-                **options,
+                [width, height, pitch, w, cut_out, backdrops, tones, weight, *images, at["by_similarity"]],
+                [at["by_toned"], of(by_colour), of(by_alpha, wp.float32)],
             )
         # Allocate new tensors here, because the next call overwrites the buffers.
         mixing = buffers["by_toned"].T @ buffers["front"]
@@ -177,7 +173,7 @@ class _Loss(torch.autograd.Function):
             by_alpha.reshape(height, width) if cut_out else None,
             by_tone,
         )
-        return buffers["loss"].mean()
+        return (1.0 - w) * buffers["off"].mean() + w * (1.0 - buffers["similarity"].sum() / (3 * pixels))
 
     @staticmethod
     @torch.autograd.function.once_differentiable

@@ -17,8 +17,8 @@ from egs_warp.io.cameras import read_posed_images
 from egs_warp.io.photo_files import photos_without_pose
 from egs_warp.io.photos import read_photo
 from egs_warp.io.posed_images import ExcludedPhoto
-from egs_warp.training.finetune import TrainingView
 from egs_warp.training.mask_colours import is_object_black
+from egs_warp.training.training_view import TrainingView
 
 
 @dataclass(frozen=True)

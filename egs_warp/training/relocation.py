@@ -50,17 +50,18 @@ class Population:
         *,
         extent: float,
         generator: torch.Generator,
+        threads: int | None = None,
     ) -> None:
         wp.init()  # Warp receives torch's tensors before it launches any kernel
         self.tensors = tensors
         self._rates = {name: rates[name] * (extent if name == "means" else 1.0) for name in tensors}
         self._extent = extent
         self._generator = generator
-        on_gpu = next(iter(tensors.values())).is_cuda
+        self._threads = threads
         self._optimiser = torch.optim.Adam(
             [{"params": [tensor], "lr": self._rates[name], "name": name} for name, tensor in tensors.items()],
             eps=1e-15,
-            fused=on_gpu or None,
+            fused=True,
         )
 
     def step(self, *, done: float, settling: bool = False) -> None:
@@ -93,6 +94,7 @@ class Population:
                 ],
                 outputs=[_array(opacities.grad), _array(scales.grad)],
                 device=wp.device_from_torch(opacities.device),
+                threads=self._threads,
             )
 
     @torch.no_grad()
@@ -140,11 +142,9 @@ class Population:
             old, name = group["params"][0], group["name"]
             new = torch.from_numpy(state[name]).to(old.device).requires_grad_()
             moments = [key for key in state if key.startswith(f"{name}.")]
-            # Adam stores its step count on the host, unless it is fused.
-            places = {key: old.device if group["fused"] or not key.endswith(".step") else "cpu" for key in moments}
             if moments:
                 self._optimiser.state[new] = {
-                    key.removeprefix(f"{name}."): torch.from_numpy(state[key]).to(places[key]) for key in moments
+                    key.removeprefix(f"{name}."): torch.from_numpy(state[key]).to(old.device) for key in moments
                 }
             group["params"] = [new]
             self.tensors[name] = new
@@ -206,6 +206,7 @@ class Population:
                 inputs=[_JITTER * rate / self._extent**2, _FAINT, _array(noise), *shape],
                 outputs=[_array(means)],
                 device=wp.device_from_torch(means.device),
+                threads=self._threads,
             )
 
 

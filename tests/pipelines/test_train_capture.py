@@ -20,10 +20,10 @@ from tests.support.training_views import ring
 
 pytest.importorskip("torch")
 from egs_warp.pipelines.train_capture import train
-from egs_warp.training.finetune import TrainingView
 from egs_warp.training.initial_cloud import initial_cloud, middle_of
 from egs_warp.training.metrics import psnr
 from egs_warp.training.posed_photos import backdrop_colour, laid_over, read_views
+from egs_warp.training.training_view import TrainingView
 
 
 def run(folder: Path, out: Path, *flags: str) -> int:

@@ -19,13 +19,13 @@ from egs_warp.training.finetune import (  # noqa: E402
     MIN_LOG_SCALE,
     Densification,
     FinetuneOptions,
-    TrainingView,
     finetune,
     render_views,
 )
 from egs_warp.training.growth import Growth  # noqa: E402
 from egs_warp.training.metrics import psnr, ssim  # noqa: E402
 from egs_warp.training.relocation import Population  # noqa: E402
+from egs_warp.training.training_view import TrainingView  # noqa: E402
 
 
 def mean_psnr(cloud: GaussianCloud, views: list[TrainingView]) -> float:

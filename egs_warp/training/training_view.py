@@ -1,0 +1,47 @@
+"""One picture of a training, at full or reduced resolution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from egs_warp.geometry.camera import Camera, reduced_camera
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """One picture to be matched."""
+
+    camera: Camera
+    image: np.ndarray
+    """(H, W, 3) float32, 0 to 1, display-referred."""
+    alpha: np.ndarray | None = None
+    """(H, W) float32; if given, ``image`` is not yet composited over a background."""
+    weight: np.ndarray | None = None
+    """(H, W) float32, nonnegative weight of each pixel in the L1 loss; None weights all pixels equally."""
+    name: str = ""
+    """Name of the photo, for messages."""
+
+    def reduced(self, factor: int) -> TrainingView:
+        """Return the view with both sides divided by ``factor``, rounded down.
+
+        Each pixel is the mean of ``factor`` x ``factor`` pixels, and has the smallest of their weights.
+        """
+        if factor == 1:
+            return self
+        camera = reduced_camera(self.camera, factor)
+        width, height = camera.width, camera.height
+
+        def blocks(values: np.ndarray) -> np.ndarray:
+            """Return (height, width, factor^2, channels), the pixels of each block."""
+            used = values[: height * factor, : width * factor].reshape(height, factor, width, factor, -1)
+            return used.swapaxes(1, 2).reshape(height, width, factor * factor, -1)
+
+        weight = None if self.weight is None else blocks(self.weight).min(axis=2)[..., 0]
+        if self.alpha is None:
+            return replace(self, camera=camera, image=blocks(self.image).mean(axis=2), weight=weight)
+        alpha = blocks(self.alpha)
+        cover = alpha.mean(axis=2)
+        image = (blocks(self.image) * alpha).mean(axis=2) / np.maximum(cover, 1e-6)
+        return replace(self, camera=camera, image=image, alpha=cover[..., 0], weight=weight)
