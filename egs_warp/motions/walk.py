@@ -216,7 +216,7 @@ class Walk:
         )
         follow = min(control.follow / self._time_unit, 0.7 / dt)
         return [
-            centre_of_mass_velocity(body, com_velocity @ axes, self._posture.com_weight),
+            centre_of_mass_velocity(body, com_velocity @ axes, control.com),
             AngularMomentumObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, follow * (next_pose - local) @ axes, control.pose),
             *(self._foot_objective(index, local, before, after, elapsed, dt) for index in self.swinging),

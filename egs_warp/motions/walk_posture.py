@@ -66,8 +66,6 @@ class WalkPosture(Protocol):
     """Maximum distance of a landing foot from its nominal foothold to catch the body, m."""
     timing: GaitTiming
     """Timing of the gait at nominal speed."""
-    com_weight: float
-    """Weight of the velocity of the centre of mass, for balance."""
     swing_weight: float
     """Weight of the velocity of a swinging sole."""
     stance_weight: float
@@ -100,7 +98,6 @@ class LeggedPosture:
         self.lift = MAX_FOOT_LIFT * body.height
         self.capture_range = MAX_STEP_PER_LEG * min(foot.length for foot in feet)
         self.timing = LEGGED_TIMING
-        self.com_weight = 60.0
         self.swing_weight = 4.0
         self.stance_weight = 100.0
 
@@ -135,7 +132,6 @@ class RockingPosture:
         self.step_limits = StepLimits(0.5 * pivot * self._width, 0.5 * pivot)
         self.lift = min(MAX_ROLL * self._width, MAX_FOOT_LIFT * body.height)
         self.capture_range = 0.0
-        self.com_weight = 300.0  # if friction does not suffice for both, balance has priority over turning
         self.swing_weight = 2.0  # half of the body swings; a faster swing pushes the rest back, behind its feet
         self.stance_weight = 1.0  # a patch that rotates on the ground slides at its edges
 
