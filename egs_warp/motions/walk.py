@@ -36,7 +36,7 @@ from egs_warp.motions.route import Route, StepLimits
 from egs_warp.motions.route_check import check_route
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.walk_plan import WalkControl, WalkPhase, WalkPlan
-from egs_warp.motions.walk_posture import select_posture
+from egs_warp.motions.walk_posture import RockingPosture, rocking_reason, select_posture
 
 MIN_FOOT_LOAD = 0.01
 """Share of the weight that a foot must carry to be considered landed."""
@@ -102,6 +102,7 @@ class Walk:
         )
         self.feet = feet
         self._posture = posture(stance, feet)
+        self._gait_notes = [f"the body waddles: {rocking_reason(stance)}"] if posture is RockingPosture else []
         self._planner = FootholdPlanner(stance, feet)
         self._start_com = body.centre_of_mass(standing)
         self._footprint = self.ground.local(stance.contact_points)[:, :2] - self._start_com[:2]
@@ -176,8 +177,8 @@ class Walk:
         """Return None: each step starts from the measured feet."""
 
     def notes(self) -> list[str]:
-        """Return messages for the user about shortened, repeated and late steps."""
-        notes = []
+        """Return messages for the user about the gait and about shortened, repeated and late steps."""
+        notes = list(self._gait_notes)
         if self._step_limits.length < self._requested_length:
             requested, reached = self._requested_length / self.body.height, self._step_limits.length / self.body.height
             notes.append(
@@ -215,7 +216,7 @@ class Walk:
         )
         follow = min(control.follow / self._time_unit, 0.7 / dt)
         return [
-            centre_of_mass_velocity(body, com_velocity @ axes, self._posture.com_weight),
+            centre_of_mass_velocity(body, com_velocity @ axes, control.com),
             AngularMomentumObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, follow * (next_pose - local) @ axes, control.pose),
             *(self._foot_objective(index, local, before, after, elapsed, dt) for index in self.swinging),

@@ -66,8 +66,6 @@ class WalkPosture(Protocol):
     """Maximum distance of a landing foot from its nominal foothold to catch the body, m."""
     timing: GaitTiming
     """Timing of the gait at nominal speed."""
-    com_weight: float
-    """Weight of the velocity of the centre of mass, for balance."""
     swing_weight: float
     """Weight of the velocity of a swinging sole."""
     stance_weight: float
@@ -100,7 +98,6 @@ class LeggedPosture:
         self.lift = MAX_FOOT_LIFT * body.height
         self.capture_range = MAX_STEP_PER_LEG * min(foot.length for foot in feet)
         self.timing = LEGGED_TIMING
-        self.com_weight = 60.0
         self.swing_weight = 4.0
         self.stance_weight = 100.0
 
@@ -135,7 +132,6 @@ class RockingPosture:
         self.step_limits = StepLimits(0.5 * pivot * self._width, 0.5 * pivot)
         self.lift = min(MAX_ROLL * self._width, MAX_FOOT_LIFT * body.height)
         self.capture_range = 0.0
-        self.com_weight = 300.0  # if friction does not suffice for both, balance has priority over turning
         self.swing_weight = 2.0  # half of the body swings; a faster swing pushes the rest back, behind its feet
         self.stance_weight = 1.0  # a patch that rotates on the ground slides at its edges
 
@@ -188,22 +184,36 @@ def select_posture(stance: Stance) -> tuple[tuple[Foot, ...], type[LeggedPosture
     """Return the feet on which a body walks, its own or the two sides of its base, and the class of its posture. There
     are no feet if the body lies or rolls."""
     feet, standing, height = stance.feet(), stance.ground.local(stance.standing), stance.body.height
-    heights = standing[:, 2] - standing[:, 2].min()
     base = stance.base()
-
-    def on_leg(foot: Foot) -> bool:
-        # On few feet, a swing is a fall that the next footprint catches. A leg that is wider than long is too short.
-        return foot.length >= max(
-            MIN_LEG_LENGTH * height, _width(standing[foot.sole]) if len(feet) < MAX_SEQUENTIAL_FEET else 0.0
-        )
-
-    if base is SupportKind.FEET and all(on_leg(foot) for foot in feet):
+    if base is SupportKind.FEET and not _missing_leg_lengths(stance):
         return feet, LeggedPosture
     if base is SupportKind.FEET and len(feet) == 2:
         return feet, RockingPosture
     if base in (SupportKind.LYING, SupportKind.ROUND_BASE):
         return (), RockingPosture
+    heights = standing[:, 2] - standing[:, 2].min()
     return split_base(standing[:, :2], heights, np.flatnonzero(heights < _SOLE_HEIGHT * height), height), RockingPosture
+
+
+def rocking_reason(stance: Stance) -> str:
+    """Return the reason why the body at ``stance`` rocks on the sides of its base instead of swinging its legs."""
+    if stance.base() is not SupportKind.FEET:
+        return "it stands on one base, without separate legs"
+    length, needed = max(_missing_leg_lengths(stance), key=lambda pair: pair[1] - pair[0])
+    unit = stance.body.height
+    return f"a leg is {length / unit:.2f} body heights long, and it swings legs of at least {needed / unit:.2f}"
+
+
+def _missing_leg_lengths(stance: Stance) -> list[tuple[float, float]]:
+    """Return the length and the required length in metres of each leg that is too short to swing. On few feet, a swing
+    is a fall that the next footprint catches, so that a leg that is wider than long is too short."""
+    feet, standing = stance.feet(), stance.ground.local(stance.standing)
+    few = len(feet) < MAX_SEQUENTIAL_FEET
+    required = [
+        (foot.length, max(MIN_LEG_LENGTH * stance.body.height, _width(standing[foot.sole]) if few else 0.0))
+        for foot in feet
+    ]
+    return [(length, needed) for length, needed in required if length < needed]
 
 
 def _width(sole: np.ndarray) -> float:

@@ -18,6 +18,7 @@ from egs_warp.motions.walk_posture import (
     LeggedPosture,
     RockingPosture,
     WalkPosture,
+    rocking_reason,
     select_posture,
 )
 from tests.support.meshes import carved, coarse_stool, figure
@@ -121,3 +122,10 @@ def test_a_stump_is_no_leg_of_few_feet(count: int, tall: float, swings: bool) ->
     """A leg that is wider than long cannot reach the capture point, so a body on three of them does not swing its legs.
     With four or more feet, the other feet support the body."""
     assert (select_posture(block_place(on_blocks(count, tall)))[1] is LeggedPosture) is swings
+
+
+def test_the_reason_for_waddling_names_the_shortest_leg_or_the_base() -> None:
+    """The blocks of a body 0.7 high join the slab 0.2 above the ground, and their soles are 0.4 wide."""
+    stumps = block_place(on_blocks(3, 0.3))
+    assert rocking_reason(stumps) == "a leg is 0.29 body heights long, and it swings legs of at least 0.57"
+    assert rocking_reason(block_place()) == "it stands on one base, without separate legs"
