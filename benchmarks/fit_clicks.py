@@ -104,7 +104,7 @@ def regression(features: np.ndarray, labels: np.ndarray, weights: np.ndarray) ->
 
 
 def click_scene(labelled: LabelledScene, click: Click, weights: EnergyWeights) -> ClickScene:
-    """Return the energy of one ``click`` on the object."""
+    """Return the terms of the energy that all clicks share, for the object at the first ``click``."""
     scale = picture_scale(click.point, labelled.surface.cameras)
     return ClickScene.of(labelled.surface, labelled.ground, scale, weights=weights)
 

@@ -9,12 +9,12 @@ _MAX_MESSAGE_LENGTH = 2000
 """Maximum number of characters of a message; the middle of a longer one is cut out."""
 
 _MIN_BEGINNING = 3
-"""Minimum number of letters of the beginning of a name."""
+"""Minimum length of an unknown name that is completed to a longer one, in characters."""
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
-    """Return `` (did you mean 'walk'?)`` with the member of ``names`` that begins with the unknown ``name`` or, if none
-    does, is most similar to it; an empty text if none is similar."""
+    """Return `` (did you mean 'walk'?)`` with the member of ``names`` that begins with the unknown ``name``, or else
+    with the most similar one; an empty text if none is similar."""
     # Ignore case; of members that differ only in case, suggest the first. No suggestion for a name that is a member:
     # it is in the wrong position, not misspelt.
     by_lower = {str(known).lower(): str(known) for known in reversed(list(names))}

@@ -38,7 +38,7 @@ def test_each_task_is_done_once() -> None:
 
 
 def test_all_results_are_in_order_and_nothing_runs_after_an_error() -> None:
-    """The caller of tasks of which one fails may reuse their memory: the others have ended or never start."""
+    """After one task has failed, the caller may reuse the memory of all: the others have ended or never start."""
     assert run_all([lambda number=number: number**2 for number in range(100)]) == [n**2 for n in range(100)]
     running, done = threading.Event(), []
 

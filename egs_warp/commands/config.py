@@ -24,7 +24,7 @@ _PATHS = (
 )
 """Flags that may name files. In the YAML file, these paths are relative to its folder."""
 _WRITTEN = ("save_collision_mesh",)
-"""Flags that name files that the run writes, and that need not exist. Their paths are relative to the folder, too."""
+"""Flags that name files which the run writes, so they need not exist. Their paths are relative to the folder, too."""
 _WORDS = ("auto", "fixed", "follow", "orbit", "patch", "telea", "ns", TRANSPARENT)
 """Values of these flags that do not name files."""
 _IN_MOTION = re.compile(r"\S+\.(?:json|csv)", re.IGNORECASE)

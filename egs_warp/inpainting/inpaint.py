@@ -56,8 +56,8 @@ _GAP_EDGE = 6.0
 _CHANNEL = 9.0
 """Half width, in texels. A channel narrower than this does not connect a gap to the empty space beyond the floor."""
 _EDGE_BAND = 0.1
-"""Distance from the edge of the floor within which Gaussians below the floor belong to its side, as a fraction of the
-hole's side."""
+"""Distance from the edge of the floor within which Gaussians below it are the side of a table or a pedestal, as a
+fraction of the hole's side."""
 _MIN_RIM_FRACTION = 0.4
 """Minimum fraction of the hole's edge that must be floor."""
 _MAX_ISLAND_AREA = 0.15
@@ -157,8 +157,8 @@ def inpaint(
     before = rectify(retained, window, thickness=thickness)
     grown, known, void = _closed(grown, before.alpha)
     _check(grown, known)
-    # The gaps that were added to the hole contain haze, too. What lies below the floor at its edge is its side, for
-    # example that of a table or of a pedestal.
+    # The gaps that were added to the hole contain haze, too. Gaussians below the edge of the floor are the side of a
+    # table or a pedestal.
     inner = grown & (distance_to(void) > _EDGE_BAND * _TEXELS_ACROSS) if void.any() else grown
     junk = _in_hole(background, window, inner, side)
     grown, known, stained = _without_stain(grown, known, before)
@@ -184,7 +184,7 @@ def inpaint(
     except UserError as error:
         if inpainter is not None:
             raise
-        # The rim of the floor is narrower than a patch.
+        # The remaining floor is narrower than a patch.
         painted = OpenCvInpainter().fill(image, grown, known)
         notes = (f"the colours around the hole were continued smoothly ({error})",)
     clock.lap("inpaint")
@@ -295,7 +295,7 @@ def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray
     touching = np.isin(gaps, np.unique(gaps[mask])) & ~mask
     hole = mask.copy()
     if touching.any():
-        # The floor is stained where it becomes thin, next to a gap. Of a narrow rim, the half at the edge remains.
+        # The floor is stained where it becomes thin, next to a gap. The outer half of a narrow rim remains.
         width = np.minimum(_GAP_EDGE, distance_to(void)) if void.any() else _GAP_EDGE
         hole = mask | (distance_to(touching) < width)
     parts, count = connected_parts(~hole)

@@ -157,7 +157,7 @@ class _Asset:
         notes = dict.fromkeys(note for found in parts.values() for part in found for note in part.notes)
         if left_out:
             unseen = f"{left_out} mesh{'es' * (left_out > 1)} of splats"
-            notes[f"left out, because the scene shows none of it: {unseen}"] = None
+            notes[f"left out, without a node in the scene: {unseen}"] = None
         transforms = np.concatenate([one.transforms for one in placed])
         up, origin = _Y_UP, None
         is_shared = np.allclose(transforms, transforms[0], rtol=1e-14, atol=1e-14)

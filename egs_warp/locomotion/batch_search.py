@@ -218,12 +218,12 @@ class BatchModeSearch:
 def _repeat_on_host(
     packed: torch.Tensor, result: torch.Tensor, repeat: Callable[[np.ndarray], np.ndarray | None]
 ) -> None:
-    """Replace the results of numerical failures by results of the host, computed in parallel.
+    """Repeat the failed problems on the host, in parallel, and store their results.
 
     Args:
         packed: (c, ...) packed QP of each world.
-        result: (c, ...) packed results. Failures for which ``repeat`` returns None stay failures.
-        repeat: function of the packed QP of a world that returns the packed result, without trailing zeros.
+        result: (c, ...) packed results, updated in place. A failure for which ``repeat`` returns None remains one.
+        repeat: function that maps the packed QP of a world to its packed result, without trailing zeros.
     """
     worlds = nonzero(result[:, _STATUS] != OPTIMUM_FOUND)
     if len(worlds) == 0:
@@ -238,7 +238,7 @@ def _repeat_on_host(
 
 
 def _relax_on_host(packed: np.ndarray) -> np.ndarray | None:
-    """Return the packed result of the relaxed problem for one ``packed`` QP; None without a solution."""
+    """Return the packed result of the relaxed problem of one ``packed`` QP; None if it has no solution."""
     relaxed = solve_relaxed(parse_packed_qp(packed)[0], QpSolver.OSQP)
     if relaxed is None:
         return None

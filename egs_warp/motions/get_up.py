@@ -41,11 +41,11 @@ _STROKE = 0.12
 _MIN_STROKE = 0.04
 """Smallest remaining angle in radians over which a push is planned."""
 _MIN_MARGIN, _MAX_MARGIN = 0.05, 0.07
-"""Bounds of the planned excess of the energy at the top of the roll, as a height in body heights."""
+"""Bounds of the planned excess of energy at the top of the roll, divided by the weight, in body heights."""
 _PASSED_HEIGHT = 0.005
-"""Missing height in body heights below which a body has passed the top of the roll."""
+"""Remaining rise in body heights below which a body counts as past the top of the roll."""
 _MIN_LIFT_SHARE = 0.5
-"""Share of the required height that the first push has to reach for another try."""
+"""Share of the required rise that a push has to reach so that the body tries again."""
 _PUSH_RAMP_TIME = 0.4
 """Time in sqrt(H / g) in which a push grows to its full size."""
 _BASE_HEIGHT = 0.3
@@ -54,9 +54,9 @@ _EDGE_ANGLE = 35.0
 """Angle in degrees that determines the edge over which the body rolls: the nodes of the edge would touch first if the
 ground were steeper by this angle, or by half of the tilt of the base if that is smaller."""
 _EDGE_BAND = 0.005
-"""Depth in body heights of the nodes of the edge."""
+"""Height in body heights above the lowest node, measured with the steeper ground, up to which nodes form the edge."""
 _TOUCHING_HEIGHT = 0.02
-"""Height in body heights above the lowest node up to which nodes of a lying body can push."""
+"""Height in body heights above the lowest node up to which nodes of a lying body can push against the ground."""
 _LANDED_ANGLE = 20.0
 """Maximum tilt in degrees of a base that is considered landed."""
 _CROUCH_FRACTION = 0.75
@@ -130,7 +130,7 @@ class _Roll:
     missing: float
     """Height in metres by which the centre of mass still has to rise to pass the top of the roll."""
     rear: float
-    """Distance in metres, ahead of the centre of mass, of the rear end of the support."""
+    """Position of the rear end of the support in the direction of the roll, relative to the centre of mass, m."""
     pushes: bool
     """True if the ground supports the body behind the edge."""
 
@@ -233,7 +233,7 @@ class GetUp:
         momentum = momentum + body.mass * np.cross(arm, body.centre_of_mass(state.velocities))
         path = tipping_path(body.node_mass, self._arms @ turn.T, axis, angle, normal)
         if self.phase is GetUpPhase.LIE:
-            # The frame of a fallen body is at the height of its base, which may be off the ground.
+            # The origin of a fallen body's frame is at the height of its base, which may be above the ground.
             self._ground_level = float((x @ normal).min())
         rise = max(path.top + self._ground_level - float(com @ normal), 0.0)
         behind, rear = 0.0, float((edge - com) @ ahead)
@@ -287,14 +287,14 @@ class GetUp:
                 self._catch(state, GetUpPhase.STAND, 1.0)
 
     def _has_captured(self, roll: _Roll) -> bool:
-        """Return True if the capture point has passed the rear of the support, so that the body does not roll back."""
+        """Return True if the capture point has passed the rear end of the support. Before that, the body rolls back."""
         height = max(float(roll.arm @ self.ground.axes[2]), _PASSED_HEIGHT * self.body.height)
         # A body that rolls rigidly about the edge has the angular momentum J w = m h v about it.
         velocity = roll.inertia * roll.rate / (self.body.mass * height)
         return velocity * np.sqrt(height / self._gravity) > roll.rear
 
     def _is_too_weak(self, state: BodyState, roll: _Roll) -> bool:
-        """Return True if one push of the muscles cannot lift the centre of mass over the edge, and note why."""
+        """Return True if no push of the muscles can lift the centre of mass over the edge, and store the reason."""
         muscles, body, up = self._stance.muscles, self.body, self.ground.axes[2]
         if muscles is None or muscles.segment_count == 0 or self.tries > 0:
             return False
@@ -311,25 +311,26 @@ class GetUp:
         if lift > roll.missing:
             return False
         self._weakness = (
-            f"a push of its muscles lifts the centre of mass by at most {lift / body.height:.2g} body heights, and the "
-            f"roll over the edge of its base takes {roll.missing / body.height:.2g}"
+            f"a push of its muscles lifts the centre of mass by at most {lift / body.height:.2g} of the "
+            f"{roll.missing / body.height:.2g} body heights needed to roll over the edge of its base"
         )
         return True
 
     def _fell_far_short(self) -> bool:
         """Return True if the last push lifted the centre of mass by less than ``_MIN_LIFT_SHARE`` of the required
-        height, and note why."""
+        rise, and store the reason."""
         lift = self._rise - self._shortfall
         if self.tries == 0 or lift >= _MIN_LIFT_SHARE * self._rise:
             return False
         self._weakness = (
             f"its push lifted the centre of mass by {max(lift, 0.0) / self.body.height:.2f} of the "
-            f"{self._rise / self.body.height:.2f} body heights that the roll over the edge of its base takes"
+            f"{self._rise / self.body.height:.2f} body heights needed to roll over the edge of its base"
         )
         return True
 
     def _begin_try(self, roll: _Roll) -> None:
-        """Plan a try. Correct the planned excess by the measured excess of the last roll, at least by half."""
+        """Plan the next try. After a failed one, change the planned excess by the difference of the first plan from the
+        measured excess, but by at least half of the first plan."""
         height = self.body.height
         if self.tries == 0:
             self._aim = float(np.clip(0.5 * roll.path.max_excess, _MIN_MARGIN * height, _MAX_MARGIN * height))
@@ -391,8 +392,8 @@ class GetUp:
         ]
 
     def _push_acceleration(self, roll: _Roll, elapsed: float) -> float:
-        """Return the angular acceleration in rad/s^2 of a body that pushes itself up. Over the rest of its stroke, a
-        constant torque adds the energy that the body lacks to pass the top with the planned excess."""
+        """Return the angular acceleration in rad/s^2 of a body that pushes itself up. A constant torque over the rest
+        of the stroke supplies the energy that the body lacks to pass the top with the planned excess."""
         weight = self.body.weight
         kinetic = 0.5 * roll.inertia * max(roll.rate, 0.0) ** 2
         rise = roll.missing + (self._margin if roll.missing > _PASSED_HEIGHT * self.body.height else 0.0)

@@ -14,14 +14,14 @@ from egs_warp.motions.support import SupportPolygon
 
 _MIN_MARGIN = 0.5
 """Minimum distance of the centre of mass from the edge of the supported part of the base, relative to its distance from
-the edge of the whole base. A body that lands with less, and a little too far, tips over the edge."""
+the edge of the whole base. With less, a body that lands a little too far tips over the edge of the ground."""
 _MAX_HOLLOW = 0.1
-"""Depth in body heights of the ground below a part of the base from which this part is not supported. Hollows of rough
-ground are less deep."""
+"""Depth of the ground below a part of the base, in body heights, at which it no longer supports this part. Hollows of
+rough ground are shallower."""
 _MAX_DROP = 1.0
 """Maximum depth of the landing place below the start, body heights."""
 _TRIED = 20
-"""Number of shorter distances that are tried for the advice of a message."""
+"""Number of equal parts of the requested distance. The message suggests the largest supported multiple of a part."""
 
 
 def landing_of(stance: Stance, target: JumpTarget) -> JumpTarget:
@@ -44,8 +44,9 @@ def check_landing(stance: Stance, target: JumpTarget) -> None:
     """Check that the ground supports the body where it will land.
 
     Raises:
-        TargetError: no ground or only ground that is far below is there, or the centre of mass would be too close to
-            the edge of the supported part of the base. The message has the largest distance with enough support.
+        TargetError: there is no ground at the landing place, the ground is too far below, or the centre of mass would
+            be too close to the edge of the supported part of the base. The message suggests the largest distance with
+            enough support.
     """
     if _is_supported(stance, target.distance, target.rise):
         return
@@ -55,7 +56,7 @@ def check_landing(stance: Stance, target: JumpTarget) -> None:
         for distance in target.distance * np.arange(_TRIED - 1, 0, -1) / _TRIED
         if _is_supported(stance, distance, max(_rise(stance, distance), -2.0 * _MAX_DROP * height))
     ]
-    # Round down, so that the distance of the advice is supported.
+    # Round down, so that the suggested distance is supported.
     advice = "turn to another direction first"
     if supported:
         advice = f"give a distance of at most {np.floor(100.0 * supported[0] / height) / 100.0:g}"
@@ -75,8 +76,8 @@ def _rise(stance: Stance, distance: float) -> float:
 
 
 def _is_supported(stance: Stance, distance: float, rise: float) -> bool:
-    """Return True if the body has enough ground below its base after a displacement of ``distance`` ahead and ``rise``
-    up, m."""
+    """Return True if enough of the base is supported by the ground after a displacement by ``distance`` m ahead and
+    ``rise`` m up."""
     # Half spaces have no edges.
     if distance == rise == 0.0 or all(
         isinstance(surface, Solid) and len(surface.faces) == 1 for surface in stance.solids
@@ -87,12 +88,12 @@ def _is_supported(stance: Stance, distance: float, rise: float) -> bool:
         return False
     shift = distance * stance.ground.axes[0] + rise * up
     points = stance.contact_points
-    # Distances to the ground that differ from those at the start, also on a slope that continues.
+    # Increase of the height of each point above the ground; zero on a slope that continues.
     lower = np.array(
         [surface_above(stance.solids, point, up) - surface_above(stance.solids, point + shift, up) for point in points]
     )
     has_ground = lower < _MAX_HOLLOW * height
-    # A body that jumps down must not hit the edge that it has left.
+    # A body that jumps down must not land on the edge from which it jumped.
     if rise < -_MAX_HOLLOW * height and (lower < -_MAX_HOLLOW * height).any():
         return False
     if has_ground.all() or not has_ground.any():

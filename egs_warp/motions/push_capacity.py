@@ -1,9 +1,9 @@
 """Largest work of one push against the ground, from the strength of the muscles and the elasticity of the body.
 
-The body is a linear spring in its present shape. Its muscles, at the bounds of their activations, move a point on the
-ground by the distance d relative to the edge about which the body rolls. If the ground keeps the point in place, they
-press on it with the force F = d / c instead, where c is the compliance between point and edge. So a push over the whole
-distance does at most the work F d / 2.
+The elasticity is linearised at the present shape. With all activations at their bounds, a point on the ground would
+move by the distance d relative to the edge about which the body rolls. If the ground holds the point in place, it
+presses on the ground with the force F = d / c instead, where c is the compliance between point and edge. So a push over
+the whole distance does at most the work F d / 2.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import activation_jacobian
 
 _SOFTNESS = 1e-6
-"""Diagonal term that makes the stiffness of a free body regular, relative to its largest entry."""
+"""Diagonal term, relative to the largest entry, that makes the stiffness matrix of a free body nonsingular."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class PushCapacity:
     """Capacity of the muscles to push a point away from the body."""
 
     force: float
-    """N, largest force on a point that does not move."""
+    """N, largest force on a point that is held in place."""
     stroke: float
-    """m, largest distance by which the point moves without a force."""
+    """m, largest distance by which the point moves if no force resists."""
 
     @property
     def work(self) -> float:

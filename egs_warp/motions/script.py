@@ -43,7 +43,7 @@ _MAX_SECONDS = 3600.0
 _NAMES = ", ".join(motion_names())
 _GESTURES = tuple(name for name, kind in MOTIONS.items() if kind.gesture is not None)
 _CONJUNCTIONS = ("and", "then", "while", "with", "&")
-"""Words between two motions that mean a separator."""
+"""Words between two motions that stand for a separator, in lower case."""
 _SEPARATORS = "separate motions by commas, and add a gesture on top of a motion by +, as in 'jump, walk 1 + nod'"
 _AT = Value("at", 0.0, 0.0, 60.0, "seconds")
 """Parameter of a gesture on top of a motion: its start after the start of the motion, s."""

@@ -247,10 +247,10 @@ class StandFor:
 
 
 class StandInstead(StandFor):
-    """Short stand in place of a motion whose target is out of reach where the motion starts."""
+    """Short stand in place of a motion whose target is out of reach when the motion starts."""
 
     def __init__(self, stance: Stance, reason: str) -> None:
-        """Create the stand; ``reason`` describes the target for the report."""
+        """Create the stand; ``reason`` says in the report why the target is out of reach."""
         super().__init__(stance, _INSTEAD_TIME)
         self._reason = reason
 
@@ -261,8 +261,8 @@ class StandInstead(StandFor):
 
 
 def or_stand(task: MotionTask) -> MotionTask:
-    """Return ``task`` with a short stand in place of its motion if its target is out of reach where it starts; the
-    result of the stand is the missed target."""
+    """Return ``task`` with a fallback: if the target of its motion is out of reach when the motion starts, the body
+    stands for a moment instead, and the result of the stand reports the missed target."""
 
     def begin(stance: Stance) -> BodyMotion:
         try:

@@ -1,5 +1,5 @@
 """Tipping of a rigid body over the edges of its convex hull: the height that its centre of mass has to reach, and the
-energy with which it arrives upright without tipping over the other side.
+largest energy with which it comes to stand upright without tipping over the other side.
 
 See docs/concepts/motions.md.
 """
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 _ANGLE_STEP = np.radians(2.0)
 """Angle between the orientations at which heights are computed, radians."""
 _NEXT_EDGE_ANGLE = 0.5 * np.pi
-"""Angle past the upright orientation up to which the barrier on the other side is searched, radians."""
+"""Angle past the upright orientation up to which the maximum on the other side is searched, radians."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class TippingPath:
 
     @property
     def max_excess(self) -> float:
-        """Height in metres by which the energy of the body at the top may exceed the potential energy, so that the body
-        does not tip over the other side after the impact. It can be negative: a tall body on a narrow base tips over
-        even if it is at rest at the top, unless its muscles brake it."""
+        """Largest kinetic energy at the top, divided by the weight, in metres, with which the body does not tip over
+        the other side after the impact. It can be negative: a tall body on a narrow base tips over even from rest at
+        the top, unless its muscles brake it."""
         if self.speed_ratio <= 0.0:
             return np.inf
         return (self.next_top - self.upright) / (self.speed_ratio**2 * self.inertia_ratio) - (self.top - self.upright)

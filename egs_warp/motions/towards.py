@@ -101,7 +101,7 @@ def script_among(text: str, others: Mapping[str, OtherBody], stance: Stance) -> 
 
 
 def check_motion(text: str, others: Collection[str]) -> None:
-    """Raise ``UserError`` for a mistake in motions of a creature among bodies with the names ``others``."""
+    """Raise ``UserError`` for a mistake in the motions of a creature; ``others`` are the names of the other bodies."""
     for number, text_of_piece in enumerate(_pieces(text), start=1):
         where = f"motion {number} ({text_of_piece!r})"
         piece = _parse(text_of_piece, where)

@@ -41,9 +41,9 @@ class WalkControl:
     """
 
     com: float = 300.0
-    """Weight of the velocity of the centre of mass, for balance. With a fifth of it, the centre of pressure of a robot
-    on two feet is on average 0.01 to 0.04 body heights ahead of the requested one, and the robot falls backward. Where
-    friction does not suffice for both, balance has priority over turning."""
+    """Weight of the velocity of the centre of mass, for balance. With a fifth of this weight, the centre of pressure of
+    a robot on two feet is on average 0.01 to 0.04 body heights ahead of the requested one, and the robot falls
+    backward. Where friction does not suffice for both, balance has priority over turning."""
     spin: float = 60.0
     pose: float = 0.1
     unload: float = 10.0

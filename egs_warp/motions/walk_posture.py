@@ -201,7 +201,7 @@ def rocking_reason(stance: Stance) -> str:
         return "it stands on one base, without separate legs"
     length, needed = max(_missing_leg_lengths(stance), key=lambda pair: pair[1] - pair[0])
     unit = stance.body.height
-    return f"a leg is {length / unit:.2f} body heights long, and it swings legs of at least {needed / unit:.2f}"
+    return f"a leg is {length / unit:.2f} body heights long; to swing, it would have to be at least {needed / unit:.2f}"
 
 
 def _missing_leg_lengths(stance: Stance) -> list[tuple[float, float]]:

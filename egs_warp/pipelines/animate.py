@@ -216,7 +216,7 @@ def animate(
     ffmpeg_program()
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
         if background is not None and not run.has(BACKGROUND):
-            # Another film, a page or an export of the finished run shows it again.
+            # ``render``, ``view`` and ``export`` of the finished run read it.
             write_ply(run.file(BACKGROUND), background)
         with preparation_bar(quiet=quiet) as begin_stage:
             creature_options = replace(options.creature, overlap=max(options.creature.overlap, jump_style.overlap))

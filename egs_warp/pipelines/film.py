@@ -41,8 +41,8 @@ SHEET_FRAMES = 12
 SPLIT_KEY_FRAMES = 24
 """Number of frames whose deformation decides which Gaussians are split."""
 _SHADOW_MARGIN = 0.7
-"""Width of the soft edge of a shadow straight below a body, body heights: four standard deviations of the blur of its
-highest layer (``egs_warp/render/shadow.py``), plus a texel."""
+"""Width of the soft edge of the shadow straight below a body, in body heights: four standard deviations of the blur of
+the highest layer (``egs_warp/render/shadow.py``), plus a texel."""
 _BELOW_GROUND = 0.005
 """Depth below flat ground, body heights, from which the Gaussians of a capture without a scene are hidden."""
 

@@ -30,8 +30,8 @@ _SH_STAGES = 10
 """Number of parts of the training: the SH degree is increased after each tenth of the iterations, up to the requested
 one."""
 _FULL_STEPS = 7000
-"""Number of iterations for which the learning rates are meant. A shorter training multiplies them by the square root of
-the ratio, because the distance that noisy steps of Adam cover grows with the rate and with the root of their number."""
+"""Number of iterations for which the learning rates were chosen. A shorter training multiplies them by the square root
+of ``_FULL_STEPS`` / iterations, because the distance that n noisy Adam steps cover grows as rate times sqrt(n)."""
 _FIRST_GAUSSIANS = 30_000
 """Initial number of Gaussians if there are no triangulated points and no maximum."""
 

@@ -88,8 +88,8 @@ class ShadowMap:
         self._blur = _taps(height * blurs / texel, device)
 
     def shift_to(self, centre: np.ndarray) -> np.ndarray:
-        """Return the displacement (2,), whole texels, that moves the centre of the map to ``centre`` (3,). Whole texels
-        keep the texels in place on the ground, so that a moving shadow does not flicker."""
+        """Return the displacement (2,) in whole texels that moves the centre of the map as close as possible to
+        ``centre`` (3,). Whole texels keep the texel grid fixed on the ground, so a moving shadow does not flicker."""
         away = np.array(self._plane.tangents()) @ (centre - np.array(self.ground.centre))
         return np.rint(away / self._texel)
 

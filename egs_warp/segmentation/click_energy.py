@@ -43,7 +43,8 @@ class EnergyWeights:
     crossing: float = 0.1
     """Additional length of a path where it certainly crosses a boundary, in picture radii."""
     barrier: float = 3.0
-    """The same in the comparison of clicks of both kinds: a click on the ground removes none of a foot on it."""
+    """The same for the comparison of the distances from clicks on the object and beside it. It is larger, so that a
+    click on the ground removes no part of a foot that stands on it."""
 
 
 WEIGHTS = EnergyWeights()
@@ -96,14 +97,14 @@ def boundary_log_odds(surface: SurfaceGraph, weights: EnergyWeights = WEIGHTS) -
 
 @dataclass(frozen=True)
 class ClickScene:
-    """The part of the energy that all clicks on an object have in common."""
+    """Terms of the energy that all clicks on an object share."""
 
     surface: SurfaceGraph
     links: SplatGraph
     """Links between supervoxels. ``length`` is the length of the path in picture radii, longer where it crosses a
     boundary or a gap; ``strength`` is the cost of cutting the link."""
     barriers: SplatGraph
-    """The same links, still longer where they cross a boundary."""
+    """The same links, but much longer where they cross a boundary (``EnergyWeights.barrier``)."""
     reach: np.ndarray
     """(k,) visible half-length of the Gaussians, picture radii."""
     lying: np.ndarray
@@ -216,7 +217,7 @@ def minimise(scene: ClickScene, evidence: Evidence, *, weights: EnergyWeights = 
     for _ in range(_ROUNDS):
         own, other = inside & evidence.nearby, ~inside & evidence.nearby
         ratio = _colour_ratio(scene.colours, scene.area, own, other)
-        # Colour is no reason to keep what is nearer to a click beside the object and has the colours that it hits.
+        # Near a click beside the object, colour does not count in favour of supervoxels with the colours that it hits.
         against = np.minimum(ratio, _colour_ratio(scene.colours, scene.area, own, evidence.excluded))
         ratio = np.where(opposed, against, ratio)
         again = _cut(scene, evidence, log_odds + weights.colour * np.where(evidence.nearby, ratio, 0.0), weights)

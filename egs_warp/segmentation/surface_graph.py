@@ -72,8 +72,8 @@ class SurfaceGraph:
     cameras: tuple[Camera, ...]
     """Cameras of the photos; empty if unknown."""
     visible_area: np.ndarray
-    """(n,) four times the mean area of each Gaussian in the photos, by blending weight, in squares of half of the
-    shorter side of a photo: on a convex object, its area."""
+    """(n,) four times the mean area of each Gaussian in the photos, measured by blending weight, in squares of half of
+    the shorter side of a photo. Its sum over a convex object is the surface area of the object."""
 
     @property
     def count(self) -> int:
@@ -147,8 +147,8 @@ def _features(
 
 
 def _sight(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, 3), the direction from which the photos see each Gaussian, by blending weight, zero if none shows it;
-    and (n,), ``SurfaceGraph.visible_area``."""
+    """Return (n, 3), the mean direction from which the photos show each Gaussian, weighted by blending weight and not
+    normalised, zero if none shows it; and (n,), ``SurfaceGraph.visible_area``."""
     towards, area = np.zeros((cloud.count, 3)), np.zeros(cloud.count)
     means = cloud.means.numpy().astype(np.float64)
     chosen = cameras[:: -(-len(cameras) // _VIEWS) or 1]
@@ -162,8 +162,8 @@ def _sight(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray,
 
 
 def _outward_normals(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph, towards: np.ndarray) -> np.ndarray:
-    """Return the unit normals (m, 3) of the surface at the Gaussians ``nodes`` (m,), on the side of the direction
-    ``towards`` (m, 3) from which the photos see them; zero for Gaussians that no photo shows.
+    """Return the unit normals (m, 3) of the surface at the Gaussians ``nodes`` (m,). They point to the side ``towards``
+    (m, 3) from which the photos show the Gaussians; zero for Gaussians that no photo shows.
 
     The normal of a Gaussian is its shortest axis. It is averaged with those of its neighbours, with the weight of the
     Gaussian's flatness and of the squared cosine of the angle, so that creases stay sharp.

@@ -49,7 +49,7 @@ class Growth:
             self.cap = min(self.cap, count)
 
     def restart(self) -> None:
-        """Forget the recorded losses, which cannot be compared with the next ones."""
+        """Clear the recorded losses, because those at the next resolution are not comparable."""
         self._losses.clear()
         self.history.clear()
 

@@ -77,7 +77,7 @@ class PhotoLoss:
             device = self.window.device
             pixels, padded = height * width, PADDING + (height + 2 * REACH) * self.pitch(width)
             tensors = {
-                # The kernels write no padding, so it remains zero.
+                # The kernels never write the padding that they read, so it remains zero.
                 **{name: torch.zeros(padded, device=device) for name in _PADDED},
                 **{name: torch.empty((pixels, 3), device=device) for name in ("front", "by_toned")},
                 "off": torch.empty(pixels, device=device),
@@ -115,7 +115,7 @@ def _array(tensor: torch.Tensor, dtype: Any) -> wp.array:
 
 @lru_cache(maxsize=1024)
 def _array_at(address: int, dtype: Any, count: int, device: str) -> wp.array:
-    """Return the array that starts at this address. It owns no memory, so it can be cached."""
+    """Return the array at this address. It does not own its memory, so it can be cached."""
     return wp.array(ptr=address, dtype=dtype, shape=(count,), device=device)
 
 

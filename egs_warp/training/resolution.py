@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from egs_warp.training.training_view import TrainingView
 
 _SCHEDULE = ((0.1, 4), (0.3, 2))
-"""Until each fraction of the steps, both sides of the images are divided by the factor."""
+"""Pairs of a fraction of the steps and a factor: up to this fraction, both sides of the images are divided by it."""
 _MIN_SIDE = 64
 """Minimum longer side of a reduced image, pixels."""
 

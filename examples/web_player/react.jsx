@@ -1,4 +1,4 @@
-// The player in React 19. How to make the bundle: docs/guide/player.md.
+// The web player as a React 19 component. docs/guide/player.md says how to export a bundle.
 
 import { useRef, useState } from "react";
 import "egs-player";

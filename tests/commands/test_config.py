@@ -119,7 +119,7 @@ def test_clicks_are_a_list_and_clicks_of_the_command_line_replace_those_of_the_f
 
 
 def test_files_of_named_objects_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Values with the name of an object or of a record keep it; a file that the run writes need not exist."""
+    """The names of objects and records in a value are unchanged. A file that the run writes need not exist."""
     parser, commands = cli._parsers()
     for name in ("a=odd.png", "mask.png", "picked.json", "m.glb"):
         (tmp_path / name).write_text("")

@@ -214,8 +214,8 @@ def test_a_world_continues_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.
 def test_objects_of_a_scene_given_by_flags_continue_to_the_same_bits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The run is interrupted before its film, its last steps are missing, and it is resumed from another folder,
-    without the cache."""
+    """The run is interrupted before its film and loses its last steps. It is resumed from another working directory,
+    without the cache of scenes."""
     monkeypatch.setenv("EGS_WARP_CACHE", "")
     monkeypatch.setattr("egs_warp.pipelines.scene_world.make_creature", coarse_maker(NODES))
     write_ply(tmp_path / "room.ply", two_pawns_on_a_board())

@@ -242,8 +242,8 @@ def test_overhanging_objects_stay() -> None:
 
 
 def test_the_sides_below_the_edge_of_a_floor_stay() -> None:
-    """The hole in the top of a block reaches 0.05 over its edge. All Gaussians of the sides stay; a Gaussian below the
-    middle of the hole is removed."""
+    """The hole in the top of a block extends 0.05 beyond its edge. All Gaussians of the sides remain; a Gaussian below
+    the middle of the hole is removed."""
     block = blocks(((-0.5, -0.5, -0.6), (0.5, 0.5, 0.0)))
     cloud = concatenate(block, round_ones(np.array([[0.1, 0.0, -0.3]]), 0.02))
     hole = disc(FLOOR, np.array([0.1, 0.0, 0.0]), 0.45)
@@ -255,7 +255,7 @@ def test_the_sides_below_the_edge_of_a_floor_stay() -> None:
 
 
 def test_a_narrow_rim_between_a_gap_and_the_edge_stays() -> None:
-    """The top of a block is known only at its edge, and a gap separates it from the hole. The edge stays, and the new
+    """The top of a block is known only at its edge, and a gap separates it from the hole. The edge remains, and the new
     floor closes the gap."""
     block = blocks(((-0.5, -0.5, -0.6), (0.5, 0.5, 0.0)))
     means = block.means.numpy()
@@ -273,7 +273,7 @@ def test_a_narrow_rim_between_a_gap_and_the_edge_stays() -> None:
 
 
 def test_without_patches_the_colours_are_continued_smoothly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only if no inpainter was chosen."""
+    """The error of an inpainter that the caller has chosen is raised instead."""
 
     def refuse(*_: object, **__: object) -> None:
         raise UserError("inpaint: no piece is known")

@@ -177,7 +177,7 @@ def test_contacts_without_a_pivot_are_left_to_the_host(own: float, device: str) 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_almost_redundant_contacts_do_not_fail(device: str) -> None:
-    """Rows of the contacts of a stiff base almost depend on each other, which makes the updated inverse of the active
+    """Rows of the contacts of a stiff base are nearly dependent, which makes the updated inverse of the active
     rows inaccurate. The search recovers from it. The optimum of its first region is that of the host up to the
     distance by which bounds are relaxed, since multipliers are large."""
     for seed in range(40):

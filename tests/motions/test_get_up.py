@@ -110,7 +110,7 @@ def test_a_ball_cannot_fall_over() -> None:
 
 
 def test_the_height_does_not_depend_on_the_frame_of_the_fallen_body() -> None:
-    """The stance of a fallen body has its origin at the height of its base, above the ground."""
+    """The origin of the stance of a fallen body is at the height of its base, above the ground."""
     state = lying(90.0)
     fallen = block().place.moved_to(state.positions)
     assert fallen.ground.origin[2] > 0.1
@@ -119,7 +119,7 @@ def test_the_height_does_not_depend_on_the_frame_of_the_fallen_body() -> None:
 
 
 def given_up(get_up: GetUp, state: BodyState) -> str:
-    """Return the note of a body that never moves."""
+    """Return the note of ``get_up`` for a body that never moves."""
     for step in range(3000):
         get_up.objectives(replace(state, time=step * DT), None, DT)
         if get_up.is_at_rest:
@@ -138,7 +138,7 @@ def test_a_push_without_effect_is_not_repeated() -> None:
 
 
 def test_a_weak_body_does_not_try() -> None:
-    """The muscles' strength decides before the first push."""
+    """The strength of the muscles is tested before the first push."""
     muscles = block().stepper.muscles
     weak = replace(muscles, stiffness=0.01 * muscles.stiffness)
     get_up = GetUp(replace(block().place, muscles=weak))

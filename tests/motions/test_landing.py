@@ -1,4 +1,4 @@
-"""Landing places: their height, and edges of the ground at which a jump is refused."""
+"""Landing places of jumps: their height, and refused ones at edges of the ground."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def table(edge: float) -> Solid:
 @pytest.mark.parametrize("floor", [None, -0.3, -1.5])
 def test_a_landing_on_the_edge_of_a_table_is_refused(place: Stance, floor: float | None) -> None:
     """The base is 0.4 wide, so the centre of mass must land at least 0.1 before the edge, whether there is ground below
-    the table or not. The distance of the advice is accepted."""
+    the table or not. The distance that the message suggests is accepted."""
     below = () if floor is None else (Solid((Plane(UP, -floor),)),)
     asked = JumpTarget(0.5, 0.2)
     across = np.linspace(-0.2, 0.2, 11)
@@ -67,7 +67,7 @@ def test_a_landing_on_the_edge_of_a_table_is_refused(place: Stance, floor: float
 
 
 def test_a_jump_from_a_table_lands_beyond_its_edge_or_is_refused(place: Stance) -> None:
-    """A floor 0.3 lower is a landing place, one 1.5 body heights lower is not."""
+    """A floor 0.3 body heights lower is accepted; one 1.5 body heights lower is not."""
     floors = {depth: (table(0.25), Solid((Plane(UP, depth),))) for depth in (0.3, 1.5)}
     assert landing_of(replace(place, solids=floors[0.3]), JumpTarget(0.5, 0.2)).rise == pytest.approx(-0.3)
     with pytest.raises(TargetError, match="the ground ends where the body would land"):

@@ -1,4 +1,4 @@
-"""Largest work of one push: of a block that lies on its side."""
+"""Largest work of one push of a block that lies on its side."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MADE = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD, al
 
 
 def capacity(strength: float) -> PushCapacity:
-    """Return the capacity to push one end of a side against its normal, relative to the other end."""
+    """Return the capacity of a block to push one end of a side against the normal, relative to the other end."""
     x = MADE.start.positions
     side = x[:, 0] < x[:, 0].min() + 0.05
     far, edge = (np.flatnonzero(side & (np.abs(x[:, 2] - z) < 0.05)) for z in (x[:, 2].max(), x[:, 2].min()))

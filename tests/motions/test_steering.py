@@ -61,7 +61,7 @@ def test_a_command_turns_on_the_spot_only_for_large_angles() -> None:
 
 
 def test_eight_walkers_cross_a_circle_without_touching() -> None:
-    """Discs that turn and walk as commanded, without mechanics, all reach the opposite side of a circle."""
+    """The walkers are discs that turn and walk exactly as commanded. All reach the opposite side of the circle."""
     count, radius, touching, dt = 8, 1.5, 0.45, 0.1
     angles = 2.0 * np.pi * np.arange(count) / count
     at = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)

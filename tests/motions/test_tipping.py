@@ -1,4 +1,4 @@
-"""Tipping over the edges of a convex body: heights of a block, and the energy with which it stays upright."""
+"""Tipping of a block over its edges: heights, and the largest energy with which it stays upright."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def test_heights_of_a_block(degrees: float) -> None:
 
 
 def test_excess_of_a_block() -> None:
-    """Angular momentum about the last edge is conserved when the base lands flat. With the largest excess, the rest of
-    the energy is just the barrier on the other side."""
+    """Angular momentum about the last edge is conserved when the base lands flat. With the largest excess, the energy
+    after the impact is just sufficient for the top on the other side."""
     path = block_path(90.0)
     square = 0.25 * (WIDTH**2 + HEIGHT**2)
     ratio = (square + 0.25 * (HEIGHT**2 - WIDTH**2)) / (2.0 * square)

@@ -152,8 +152,8 @@ def test_the_shadow_equals_the_reference(tilt: float, device: str) -> None:
 
 @pytest.mark.parametrize("step", [0.0, 0.4])
 def test_a_shadow_is_as_sharp_in_a_long_motion_as_in_a_short_one(step: float) -> None:
-    """A map that moves with the body gives the shadow of a small disc at the body, also when the body is not at the
-    centre of the image; one map of the whole disc does not."""
+    """A map that moves with the body gives the same shadow as the map of a small disc around the body, also when the
+    body is not at the centre of the image. A single map of the whole disc does not."""
     ball, _ = parts()
     place = np.array([step, 0.25 * step, 0.0])
     body = placed(ball, ball.means.numpy() + place)

@@ -117,7 +117,7 @@ def test_a_wide_hit_of_a_click_is_no_constraint(against_wall: GaussianCloud) -> 
 
 
 def test_the_visible_area_of_a_ball_is_its_area(twins: GaussianCloud) -> None:
-    """Its silhouette, four times which is its area (Cauchy), is larger in perspective by 1 / (1 - R^2 / D^2)."""
+    """The area is four times the silhouette (Cauchy), which perspective enlarges by 1 / (1 - R^2 / D^2)."""
     alone, radius = twins.subset(np.arange(twins.count) < BALL), 0.5
     away = float(np.linalg.norm(photos(9)[4].centre - [0.0, 0.0, 0.5]))
     expected = 4.0 * np.pi * radius**2 / (1.0 - (radius / away) ** 2) / (away * np.tan(np.radians(22.5))) ** 2

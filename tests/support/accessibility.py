@@ -1,4 +1,4 @@
-"""Checks of a page by the npm package axe-core, which tests the rules of WCAG that a program can decide."""
+"""Checks of a page by the npm package axe-core, which tests the WCAG rules that can be tested automatically."""
 
 from __future__ import annotations
 
@@ -25,6 +25,5 @@ def axe() -> str:
 
 
 def violations(page: Any, context: str | None = None) -> list[str]:
-    """Return a line for each element of the page, or of the part that the selector ``context`` names, that breaks a
-    rule."""
+    """Return a line for each element that violates a rule, in the whole page or in the part selected by ``context``."""
     return page.evaluate(_RUN, context)

@@ -1,4 +1,4 @@
-"""Rules of WCAG on every page, in light and dark colours, with menus and panels closed and open, and the keyboard."""
+"""WCAG rules on every page, in light and dark colours, with menus and panels closed and open; keyboard operation."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_view(chromium: Any, run_folder: Path, tmp_path: Path, scheme: str) -> N
     page.click("[title=Camera]")
     page.keyboard.press("?")
     assert violations(page) == []
-    # The rules find something where there is something to find.
+    # The checks detect a violation.
     page.evaluate("document.querySelector('.play').removeAttribute('title')")
     page.evaluate("document.querySelector('.play').removeAttribute('aria-label')")
     (found,) = violations(page)

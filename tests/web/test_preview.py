@@ -26,7 +26,7 @@ _KEEP_STILL_WIDTH = """{
         remove.call(this);
     };
 }"""
-"""JavaScript that records the width of the picture that a page shows while it loads, when it is removed."""
+"""JavaScript that records the width of the picture that covers a page while it loads, when the picture is removed."""
 
 
 @pytest.mark.parametrize("scale", [1.0, 40.0])

@@ -1,4 +1,4 @@
-"""The example of the player in React, built with the npm package and run in a real Chromium."""
+"""The React example of the player, built with the npm package and run in a real Chromium."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _PAGE = """<!doctype html><link rel="icon" href="data:,"><style>egs-player { wid
 
 
 def _build(folder: Path) -> None:
-    """Bundle the example as an application does that has installed the package."""
+    """Bundle the example as an application that has installed the package would."""
     (folder / "main.jsx").write_text(_MAIN, encoding="utf-8")
     (folder / "react.jsx").write_text(EXAMPLE.read_text(encoding="utf-8"), encoding="utf-8")
     packages = folder / "node_modules"

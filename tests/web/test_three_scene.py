@@ -1,4 +1,4 @@
-"""The creature in a three.js scene, in a real Chromium."""
+"""A creature in a three.js scene, in a real Chromium."""
 
 from __future__ import annotations
 

@@ -74,8 +74,8 @@ class UnitConstraints:
     cost_limit: real
     """Cost z^T z / 2 above which the problem is treated as infeasible."""
     orthogonalizations: int
-    """1 to compute the part of an entering row that is orthogonal to the active rows once, 2 to orthogonalise it again,
-    which removes the error of the first pass. Restarts always use 2."""
+    """Number of passes, 1 or 2, that orthogonalise an entering row against the active rows. The second pass removes the
+    rounding error of the first one. Restarts always use 2."""
     cancelled: wp.array[int]
     """(1,) nonzero once the result is no longer needed."""
 
@@ -423,8 +423,8 @@ def dual_iterations(rows: UnitConstraints, state: ActiveSet, active: int):
     """Run the dual iterations from a dual feasible active set, adding the most violated row first.
 
     Returns: number of active rows at the optimum; -1 if the problem is infeasible or exceeds the cost limit; -2 on
-    numerical failure, on cancellation, or after ``PIVOTS`` iterations. It is a numerical failure if the cost, which
-    each added row raises, does not rise.
+    numerical failure, on cancellation, or after ``PIVOTS`` iterations. Each added row raises the cost, so a cost that
+    does not rise is a numerical failure.
     """
     count = int(active)
     last_cost = real(-1.0)
@@ -471,15 +471,15 @@ def refine(rows: UnitConstraints, state: ActiveSet, count: int):
 def find_optimum(rows: UnitConstraints, state: ActiveSet):
     """Solve from the guessed sides ``state.side``; return the status.
 
-    Guessed rows with multipliers of the wrong sign are dropped, then violated rows are added one at a time. If rows
-    were added that almost depend on each other, the updated inverse has large errors, even after these rows have been
-    dropped. The iterations may then fail, leave violated rows or multipliers of the wrong sign, or make the problem
-    appear infeasible. In these cases the search is restarted, up to ``RESTARTS`` times, from all active rows, with a
-    new inverse.
+    Guessed rows with multipliers of the wrong sign are dropped, then violated rows are added one at a time. After
+    nearly dependent rows have been added, the updated inverse has large errors, even once these rows have been dropped
+    again. The iterations may then fail, leave violated rows or multipliers of the wrong sign, or make the problem
+    appear infeasible. In these cases the search is restarted from all active rows, with a new inverse, at most
+    ``RESTARTS`` times.
     """
     was_infeasible = int(0)
     restart = int(0)
-    # Warp would unroll a range loop.
+    # Warp would unroll a loop over a range.
     while restart <= RESTARTS:
         count = int(0)
         dropped = int(1)

@@ -25,7 +25,7 @@ def shift_of(tone: wp.array[wp.float32]) -> wp.vec3:
 
 @wp.func
 def padded_index(pixel: wp.int32, width: wp.int32, pitch: wp.int32) -> wp.int32:
-    """Return the index of a pixel's first float in an image with padded rows of ``pitch`` floats."""
+    """Return the index of the first float of a pixel in an image with padded rows of ``pitch`` floats each."""
     return PADDING + (REACH + pixel // width) * pitch + 3 * (pixel % width)
 
 

@@ -1,9 +1,9 @@
 """SSIM (Wang et al. 2004) of two images and its derivative, with a Gaussian window of 11 x 11 pixels.
 
-An image is rows of floats, three per pixel. One thread computes several neighbouring floats: ``ssim_cpu.py`` has the
-kernels for a vector register, ``ssim_cuda.py`` those for one float. Each row ends with at least ``PADDING`` zeros, and
-there are ``REACH`` rows of zeros above and below the image, so that the window needs no bounds check. The window is
-applied along the rows first, then across them.
+An image is stored by rows, with three floats per pixel. A thread computes several consecutive floats of a row:
+``ssim_cpu.py`` has the kernels for a vector register, ``ssim_cuda.py`` those for a single float. Each row ends with at
+least ``PADDING`` zeros, and there are ``REACH`` rows of zeros above and below the image, so the window needs no bounds
+check. The window is separable: it is applied along the rows first, then along the columns.
 """
 
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ PADDING = wp.constant(16)
 
 
 class SsimKernels(NamedTuple):
-    """Kernels of SSIM. The threads of a row of w pixels are ceil(3 w / lanes) ``blocks``."""
+    """Kernels of SSIM. A row of w pixels takes ceil(3 w / lanes) threads, which the kernels call ``blocks``."""
 
     lanes: int
     """Number of floats that a thread computes."""

@@ -1,4 +1,4 @@
-"""Kernels of SSIM for a CPU: sixteen floats, the largest vector register, per thread."""
+"""Kernels of SSIM for a CPU: sixteen floats per thread, as many as the largest vector registers contain."""
 
 from egs_warp.kernels.training.ssim import ssim_kernels
 

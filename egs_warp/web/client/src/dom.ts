@@ -74,7 +74,7 @@ export function button(name: Icon, title: string, onClick: () => void): HTMLButt
   return created;
 }
 
-/** Button that shows or hides `panel` and hides `others`; it tells a screen reader whether the panel is shown. */
+/** Button that shows or hides `panel` and hides `others`. Screen readers announce whether the panel is shown. */
 export function opener(
   name: Icon,
   title: string,
@@ -92,7 +92,7 @@ export function opener(
   return created;
 }
 
-/** Canvas with a 3D view. A screen reader passes the keys on to it. */
+/** Canvas with a 3D view. Its role makes screen readers pass keys on to the page. */
 export function viewCanvas(label: string, className = ""): HTMLCanvasElement {
   return element("canvas", { class: className, tabindex: "0", role: "application", "aria-label": label });
 }

@@ -58,7 +58,7 @@ function isKeyOfControl({ target, key }: KeyboardEvent, isRecorded: boolean): bo
   if (!(target instanceof HTMLElement)) return false;
   if (target instanceof HTMLSelectElement) return true;
   if (target.matches("input[type=range]")) return !isRecorded && /^(Arrow|Home|End|Page)/.test(key);
-  // A control on which the user has clicked leaves the space bar to playback.
+  // After a click on a control, the space bar still operates playback.
   return (key === " " || key === "Enter") && target.matches(":is(button, input, summary, a):focus-visible");
 }
 
@@ -361,7 +361,7 @@ export class Page {
   /** True if the next image must wait for the sorting of the splats: at the start, and on a slow machine. Without an
    * order, only the shadow would be visible; with an outdated order, the ground would hide the body. */
   private get isWaitingForSort(): boolean {
-    // The first image of a live session may precede its order: its motion must not wait.
+    // A live session is drawn before its splats are sorted, because sorting must not delay its motion.
     if (!this.isDrawn && this.live === undefined) return true;
     const isSlow = this.player.playing && this.frameTime > MAX_FRAME_TIME;
     return isSlow && this.viewers.some((viewer) => viewer.sorting);

@@ -8,7 +8,7 @@ const MAX_TIME = 20000;
 /** Duration of the transition to the page, ms. */
 const FADE_TIME = 400;
 
-/** Keep `picture`, the address of an image, for the next page of this tab. */
+/** Store `picture`, the data URL of an image, for the next page of this tab. */
 export function keepStill(picture: string): void {
   try {
     sessionStorage.setItem(KEY, picture);
@@ -17,7 +17,7 @@ export function keepStill(picture: string): void {
   }
 }
 
-/** Return the kept picture and forget it. */
+/** Return the stored picture and remove it from the storage. */
 function takeStill(): string | null {
   try {
     const picture = sessionStorage.getItem(KEY);

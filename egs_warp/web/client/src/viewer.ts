@@ -251,7 +251,7 @@ export class Viewer extends Stage {
     });
   }
 
-  /** Return a JPEG image of the current view as an address. */
+  /** Return a JPEG image of the current view as a data URL. */
   picture(): string {
     this.render();
     return this.canvas.toDataURL("image/jpeg", 0.9);
