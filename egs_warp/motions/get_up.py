@@ -45,7 +45,7 @@ _MIN_MARGIN, _MAX_MARGIN = 0.05, 0.07
 _PASSED_HEIGHT = 0.005
 """Missing height in body heights below which a body has passed the top of the roll."""
 _MIN_LIFT_SHARE = 0.5
-"""Share of the required height that the first push has to reach for another try."""
+"""Share of the required height that a push has to reach for another try."""
 _PUSH_RAMP_TIME = 0.4
 """Time in sqrt(H / g) in which a push grows to its full size."""
 _BASE_HEIGHT = 0.3
