@@ -52,8 +52,8 @@ const HELP: [string[], string][] = [
   [["?"], "these keys"],
 ];
 
-/** True if the control that has the keyboard focus uses the key of an event. In a recorded run, arrow keys move the time
- * line by frames. */
+/** True if the control that has the keyboard focus uses the key of an event. In a recorded run, arrow keys move the
+ * time line by frames. */
 function isKeyOfControl({ target, key }: KeyboardEvent, isRecorded: boolean): boolean {
   if (!(target instanceof HTMLElement)) return false;
   if (target instanceof HTMLSelectElement) return true;
