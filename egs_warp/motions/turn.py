@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpPlan, JumpTarget
 from egs_warp.motions.landing import landing_of
-from egs_warp.motions.sequence import Stance
+from egs_warp.motions.sequence import Stance, TargetError
 from egs_warp.motions.twist import AIRBORNE_FRACTION
 
 HEADING_TOLERANCE = np.radians(8.0)
@@ -132,10 +133,10 @@ class Turn:
         offset = self._goal - stance.ground.origin
         distance = float(np.linalg.norm(stance.ground.axes[:2] @ offset))
         if distance > 0.02 * stance.body.height:
-            stance = stance.with_forward(offset)
-        else:
-            distance = 0.0
-        return self._twist(stance, JumpTarget(distance, self._height))
+            # At an edge of the ground, the rotated base may lack support at the goal; then jump in place.
+            with suppress(TargetError):
+                return self._twist(stance.with_forward(offset), JumpTarget(distance, self._height))
+        return self._twist(stance, JumpTarget(0.0, self._height))
 
 
 def largest_turn(jump: Jump, stance: Stance) -> float:

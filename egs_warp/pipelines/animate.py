@@ -215,9 +215,6 @@ def animate(
     pushes = read_pushes(options.push) if options.push is not None else ()
     ffmpeg_program()
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
-        if background is not None and not run.has(BACKGROUND):
-            # ``render``, ``view`` and ``export`` of the finished run read it.
-            write_ply(run.file(BACKGROUND), background)
         with preparation_bar(quiet=quiet) as begin_stage:
             creature_options = replace(options.creature, overlap=max(options.creature.overlap, jump_style.overlap))
             creature = make_creature(cloud, up=up, plane=plane, options=creature_options, progress=begin_stage)
@@ -262,6 +259,9 @@ def animate(
             )
         # Saved first: an error while rendering does not lose the simulation.
         performance.trajectory.save(run.file("trajectory.npz"))
+        if background is not None and not run.has(BACKGROUND):
+            # Another film, a page or an export of the finished run shows it again.
+            write_ply(run.file(BACKGROUND), background)
         energy = energy_balance(performance.trajectory)
         draw_plots(run.file("plots.png"), performance.trajectory, energy)
         with atomic_write(run.file("cage.vtu")) as temporary:

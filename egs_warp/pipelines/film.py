@@ -256,11 +256,15 @@ def drawn_frames(
     """
     # The shape of uneven ground is not drawn, so its plane must not hide a creature in a hollow.
     is_flat = trajectory.ground_coefficients.size == 0
-    path, positions = path_of(trajectory), trajectory.positions[steps]
+    path = path_of(trajectory)
     centres = path[steps]
-    radius = float(np.linalg.norm((positions - centres[:, None])[..., :2], axis=-1).max())
+    # One state at a time: a copy of the states of a long run can be larger than the memory.
+    radius = max(
+        float(np.linalg.norm((trajectory.positions[step] - centre)[:, :2], axis=1).max())
+        for step, centre in zip(steps, centres, strict=True)
+    )
     filmed = Filmed(path, trajectory.height, is_flat, centres, radius + _SHADOW_MARGIN * trajectory.height)
-    poses = iter(positions)
+    poses = (trajectory.positions[step] for step in steps)
     return rendered_frames(
         deformer.deform, deformer.rest, poses, filmed, cameras, shot, scene=scene, shadow=shadow, light=light
     )

@@ -32,6 +32,9 @@ one."""
 _FULL_STEPS = 7000
 """Number of iterations for which the learning rates were chosen. A shorter training multiplies them by the square root
 of ``_FULL_STEPS`` / iterations, because the distance that n noisy Adam steps cover grows as rate times sqrt(n)."""
+_MAX_RATE_FACTOR = 4.0
+"""Maximum factor. In trainings of 1,000 iterations, four times the rates gave a higher PSNR than three times in two of
+three scenes."""
 _FIRST_GAUSSIANS = 30_000
 """Initial number of Gaussians if there are no triangulated points and no maximum."""
 
@@ -161,7 +164,7 @@ def train(
     start = _start(posed, chosen, max_gaussians, sh_degree=sh_degree, seed=seed, device=device)
     options = FinetuneOptions(
         iterations=iterations,
-        rates=LearningRates().times(max(1.0, (_FULL_STEPS / iterations) ** 0.5)),
+        rates=LearningRates().times(min(max(1.0, (_FULL_STEPS / iterations) ** 0.5), _MAX_RATE_FACTOR)),
         background=None if cut_out else background,
         densification=Densification.RELOCATION,
         max_gaussians=max_gaussians,

@@ -191,10 +191,7 @@ def finetune(
             fitting = [number for number in range(len(views)) if number not in outlier_views.indices]
             queue = [fitting[i] for i in order.permutation(len(fitting))]
         number = queue.pop()
-        factor = resolution.factor(step)
-        if factor != resolution.factor(max(step - 1, 0)):
-            growth.restart()
-        camera, target = pictures[factor][number]
+        camera, target = pictures[resolution.factor(step)][number]
         background = options.background
         if background is None:
             background = tuple(torch.rand(3, generator=generator, device=device).tolist())
@@ -239,6 +236,8 @@ def finetune(
                         f"finetune: the loss is not finite at step {at}; lower the rates or check the views"
                     )
                 outlier_views.update(viewed, value)
+                if resolution.factor(at) != resolution.factor(max(at - 1, 0)):
+                    growth.restart()
                 growth.see(value, len(tensors.means))
                 if progress is not None:
                     progress(at, value)

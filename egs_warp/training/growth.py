@@ -26,7 +26,7 @@ class Growth:
 
     def __init__(self, views: int, requested: int | None, device: str) -> None:
         self.requested = requested
-        self.cap = requested if requested is not None else _memory_cap(device)
+        self._limit = self.cap = requested if requested is not None else _memory_cap(device)
         self.history: list[tuple[float, int]] = []
         self._window = views * -(-_MIN_STEPS // views)
         self._losses: list[float] = []
@@ -49,9 +49,11 @@ class Growth:
             self.cap = min(self.cap, count)
 
     def restart(self) -> None:
-        """Clear the recorded losses, because those at the next resolution are not comparable."""
+        """Clear the recorded losses, because those at the next resolution are not comparable, and lift a cap set by
+        them, because larger images may need more Gaussians."""
         self._losses.clear()
         self.history.clear()
+        self.cap, self._idle = self._limit, 0
 
     def state(self) -> State:
         """Return the state for a checkpoint."""

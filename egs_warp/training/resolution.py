@@ -17,7 +17,7 @@ class ResolutionSchedule:
     """The factor by which the sides of all ``views`` are divided at each of ``steps`` steps."""
 
     def __init__(self, views: Sequence[TrainingView], steps: int) -> None:
-        side = min(max(view.camera.width, view.camera.height) for view in views)
+        side = min(max(view.camera.width, view.camera.height) for view in views) if steps > 0 else 0
         self._schedule = [(until * steps, factor) for until, factor in _SCHEDULE if side >= factor * _MIN_SIDE]
 
     @property

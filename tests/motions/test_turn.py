@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from egs_warp.contact.terrain import Solid
 from egs_warp.fem.body import BodyState
+from egs_warp.geometry.plane import Plane
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.turn import Turn, largest_turn
-from tests.support.stances import DT, moved
+from tests.support.stances import DT, FORWARD, moved
 
 
 def land(jump: Jump, state: BodyState) -> None:
@@ -40,6 +42,20 @@ def test_a_turn_that_falls_short_is_completed_at_its_start(place: Stance) -> Non
     land(second, BodyState(there, 0 * there, 20.0))
     turn.objectives(BodyState(there, 0 * there, 20.0), None, DT)
     assert len(turn.jumps) == 2 and turn.is_at_rest
+
+
+def test_a_turn_at_an_edge_is_completed_in_place(place: Stance) -> None:
+    """The base was supported at the start of the turn. After the first jump, its ground there ends, as it may for a
+    rotated base, so the second jump does not return."""
+    turn = Turn(place, JumpTarget(0.0, 0.2), np.radians(60.0))
+    up = np.array([0.0, 0.0, 1.0])
+    turn._stance = replace(place, solids=(Solid((Plane(up, 0.0), Plane(-FORWARD, 0.08))),))
+    short = moved(place, np.radians(35.0), np.array([0.3, 0.0, 0.0]))
+    state = BodyState(short, 0 * short, 10.0)
+    land(turn.jumps[0], state)
+    turn.objectives(state, None, DT)
+    assert len(turn.jumps) == 2 and turn.jumps[1].target == JumpTarget(0.0, 0.2)
+    assert np.degrees(turn.jumps[1].target_heading) == pytest.approx(25.0)
 
 
 def test_a_slippery_floor_takes_more_jumps(place: Stance) -> None:

@@ -141,6 +141,22 @@ def test_a_run_that_is_cut_off_leaves_its_steps(
     assert len(read_trajectory(tmp_path / "earlier-1" / PARTS).dt) == 14
 
 
+def test_an_error_in_the_preparation_keeps_the_earlier_run(
+    run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of a run with a background, which is stored with the results."""
+
+    def failing(*_: object, **__: object) -> None:
+        raise UserError("plane: nothing is above it")
+
+    given: dict[str, Any] = {"plane": thing().plane, "background": thing().cloud, "options": OPTIONS, "quiet": True}
+    run(tmp_path)
+    monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", failing)
+    with pytest.raises(UserError, match="plane: nothing is above it"):
+        animate(thing().cloud, tmp_path, overwrite=True, **given)
+    assert finished(tmp_path) and sorted(os.listdir(tmp_path)) == FILES
+
+
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_film_from_straight_above_or_below(performance: SimulatedRun, side: float) -> None:
     """The facing direction of the body is up in the picture."""

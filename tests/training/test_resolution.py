@@ -24,6 +24,8 @@ def test_images_become_finer_and_small_ones_are_not_reduced() -> None:
     assert large.factors == {1, 2, 4}
     assert small.factors == {1}
     assert small.factor(0) == 1
+    # A training without a schedule stores no reduced images.
+    assert ResolutionSchedule(render_views(cloud, ring(1, 256)), 0).factors == {1}
 
 
 def test_a_reduced_view_shows_the_same_scene() -> None:
@@ -58,6 +60,17 @@ def test_losses_of_different_resolutions_are_not_compared() -> None:
             growth.see(loss, count)
         growth.restart()
     assert growth.cap > 400
+
+
+def test_growth_that_has_ended_continues_with_larger_images() -> None:
+    growth = Growth(1, None, "cpu")
+    limit = growth.cap
+    for count in (100, 200, 400, 800):
+        for _ in range(300):
+            growth.see(0.2, count)
+    assert growth.cap < limit
+    growth.restart()
+    assert growth.cap == limit
 
 
 def test_a_training_that_starts_with_reduced_images_fits_the_full_ones() -> None:
