@@ -152,7 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     bytes_moved = count * (BYTES_READ + BYTES_WRITTEN + BYTES_OF_COLOUR) + across * BYTES_READ_ACROSS
     source = wp.zeros(bytes_moved // 32, dtype=wp.vec4, device=device)
     target = wp.empty_like(source)
-    # The copy reads and writes half of the bytes each, so it moves the same number of bytes as the deformation. The
+    # Half of the copy's traffic is reads and half is writes, so the copy moves as many bytes as the deformation. The
     # faster of two copies is used.
     calls["copy"] = lambda: wp.copy(target, source)
     calls["copy_kernel"] = lambda: wp.launch(copy_kernel, len(source), inputs=[source], outputs=[target], device=device)

@@ -103,7 +103,7 @@ def vector_arithmetic_kernel(
     # Out:
     sum_out: wp.array[wp.float32],
 ):
-    """Compute eight independent chains of multiply and add, sixteen numbers at once: the peak rate of one core."""
+    """Compute eight independent multiply-add chains of sixteen numbers each, which run at the peak rate of one core."""
     i = wp.tid() + first
     vector_chains(i, 1.0, factor, sum_out)
 

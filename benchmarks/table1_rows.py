@@ -189,7 +189,7 @@ class View:
     """(H, W) fraction of each pixel that the mesh covers."""
 
     def judge(self, cloud: GaussianCloud) -> tuple[dict[str, float], np.ndarray]:
-        """Return the scores of the cloud's image, and that image."""
+        """Return the scores of the rendered image of ``cloud``, and the image."""
         image = render_gaussians(cloud, self.camera)
         picture = np.clip(image.colour.numpy(), 0.0, 1.0)
         pair = [torch.as_tensor(one, dtype=torch.float32) for one in (picture, self.picture)]

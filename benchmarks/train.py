@@ -34,7 +34,7 @@ _WARM_UP = 20
 
 
 def row_of(case: str, method: str, cloud: GaussianCloud, seconds: float, scores: Sequence[PhotoScore]) -> Row:
-    """Return the means of the ``scores`` of one cloud."""
+    """Return the table row of one cloud, with the means of its ``scores`` over the photos."""
     row: Row = {"case": case, "method": method, "gaussians": cloud.count, "seconds": seconds}
     for which, out in (("held_out", True), ("trained_on", False)):
         chosen = [score for score in scores if score.held_out is out]

@@ -64,7 +64,7 @@ def test_a_file_that_cannot_be_written(
     reason = os.strerror(number)
     with pytest.raises(HandledExit) as end, one_line_errors("prog"), atomic_write(tmp_path / "a.json"):
         raise OSError(number, reason)
-    said = f"prog: {tmp_path / 'a.json'}: cannot be written ({reason}); choose another place\n"
+    said = f"prog: {tmp_path / 'a.json'}: cannot be written ({reason}); choose another path\n"
     assert end.value.code == status and capsys.readouterr().err == said
 
 

@@ -12,7 +12,7 @@ from .overlays import add_cage, poly_curve
 from .performance import Performance
 
 STRENGTH = "strength"
-"""Custom property of a curve: maximum force, body weights."""
+"""Name of a curve's custom property: the maximum force in body weights."""
 _DEFAULT_STRENGTH = 2.0
 _NO_REST_OBJECTS = "a bundle has neither muscles nor a cage to edit; import the folder of the run"
 _SUFFIX = "to edit"

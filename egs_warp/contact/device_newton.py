@@ -260,7 +260,7 @@ class DeviceNewtonIterate:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> bool:
-        """Return True if this is the iterate of the same array objects, with equal tensions."""
+        """Return True if this iterate was computed from the same array objects and equal tensions."""
         if self.linearization is not response or self.velocities is not velocities or self.forces is not forces:
             return False
         if tension is None or self.tension is None:

@@ -105,7 +105,7 @@ class NewtonWorkspace:
         self._graphs = GraphCache(owner.stream)
         self.base_iterate: Any = None
         self.trial_iterate: Any = None
-        """Host objects of the iterates in the slots base and trial; None if there is none."""
+        """Host objects of the iterates in the base and trial slots; None for an empty slot."""
         self.pending_iterate: Any = None
         """Iterate at the start of a queued Newton loop whose result has not been read."""
         self.started = np.zeros(0)

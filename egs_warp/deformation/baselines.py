@@ -1,4 +1,4 @@
-"""The paper's deformation of Gaussians by a cage and its baselines (Table 1), as methods of one function."""
+"""The paper's deformation of Gaussians by a cage, and the baselines it is compared with (Table 1)."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ class BatchedRecord:
         )
 
     def batched_fields(self) -> list[tuple[str, Any]]:
-        """Return names and values of the fields that are arrays or records of arrays."""
+        """Return the names and values of the fields that are arrays or records of arrays."""
         values = [(field.name, getattr(self, field.name)) for field in fields(self)]
         return [(name, value) for name, value in values if isinstance(value, BatchedRecord) or hasattr(value, "ndim")]
 
@@ -223,7 +223,7 @@ class StructPerWorld:
         """Allocate zeroed arrays.
 
         Args:
-            struct: the struct.
+            struct: Warp struct type, with the arrays as fields.
             shapes: shape of each array in one world, by field.
             worlds: number of worlds B.
             device: device of the arrays.

@@ -40,7 +40,7 @@ class SymbolicFactorization:
     indices: wp.array
     """Row indices of the full matrix."""
     first_of_equal_rows: wp.array
-    """(n,) result of ``supernodes.first_of_equal_rows``."""
+    """(n,) 0 for each row with the same pattern as the previous row, otherwise 1."""
     permutation: np.ndarray
     """(n,) position of each row in the order of elimination."""
     layout: FrontLayout

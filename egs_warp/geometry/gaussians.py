@@ -24,7 +24,7 @@ ARRAYS = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 _TRANSPARENT_LOGIT = -16.0
 """Opacity logit of a hidden Gaussian, whose opacity of 1e-7 no renderer draws."""
 _THIRD_BELOW = 0.43
-"""Height of the mean above a plane at which a third of a normal distribution lies below it, in standard deviations."""
+"""Height of the mean of a normal distribution above a plane that a third of it lies below, in standard deviations."""
 _CUT_DEVIATIONS = 2.0
 """Maximum distance between a plane and the mean of a Gaussian that is cut at the plane, in standard deviations."""
 MAX_VALUE, MAX_LOG_SCALE = 1e18, 41.0

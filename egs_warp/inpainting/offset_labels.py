@@ -20,7 +20,7 @@ from egs_warp.inpainting.rim_colours import RimColours
 _PIECES = (5, 10)
 """Radii, in pixels, of the parts of the rim that are matched to similar regions, in addition to the whole rim."""
 _RING = 6
-"""Width in pixels of the ring around the hole that is compared."""
+"""Width in pixels of the compared ring around the hole."""
 _MIN_PIXELS = 15
 """Minimum number of pixels in a part of the rim."""
 _OFFSETS_PER_PIXEL = 3

@@ -16,7 +16,7 @@ from egs_warp.inpainting.new_floor import flat_gaussians
 from egs_warp.inpainting.rectified import PlaneWindow
 
 _LOW = 0.03
-"""Height above the ground below which Gaussians are the object's rim, as a fraction of the object's size."""
+"""Height above the ground below which Gaussians belong to the object's rim, as a fraction of the object's size."""
 _TEXELS = 128
 """Texels across the rim."""
 _SPACING = 2

@@ -51,7 +51,7 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, target)
     except OSError as error:
-        raise UserError(f"{path}: cannot be written ({_reason(error)}); choose another place") from error
+        raise UserError(f"{path}: cannot be written ({_reason(error)}); choose another path") from error
     finally:
         temporary.unlink(missing_ok=True)
         if descriptor is not None:

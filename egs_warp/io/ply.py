@@ -63,7 +63,7 @@ class PlyHeader:
     """Header of a .ply."""
 
     byte_order: str | None
-    """``<`` or ``>``; None for text."""
+    """``<`` (little-endian) or ``>`` (big-endian); None for a text file."""
     elements: tuple[PlyElement, ...]
     size: int
     """Size of the header in bytes."""

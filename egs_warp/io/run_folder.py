@@ -245,7 +245,7 @@ def _exists(path: Path) -> bool:
     # Raised for names that are too long or contain null bytes.
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise UserError(f"{path}: cannot be created ({reason}); choose another place") from error
+        raise UserError(f"{path}: cannot be created ({reason}); choose another path") from error
     return True
 
 

@@ -29,7 +29,10 @@ def decode_streamed_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
     ranges: dict[int, list[tuple[int, int]]] = {}
     for file, start, count in _leaves(tree, files):
         if file >= len(names):
-            raise UserError(f"{files.source}: lod-meta.json refers to file {file} of {len(names)}; export it again")
+            raise UserError(
+                f"{files.source}: lod-meta.json refers to file {file}, counted from 0, but lists only"
+                f" {len(names)}; export it again"
+            )
         ranges.setdefault(file, []).append((start, start + count))
     if not ranges:
         raise UserError(f"{files.source}: it has no Gaussians; export it again from the tool that made it")

@@ -28,7 +28,7 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
     coded = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), swap[image.shape[2]])
     ok, data = cv2.imencode(".png", coded)
     if not ok:
-        raise UserError(f"{path}: the picture of shape {image.shape} could not be encoded as PNG")
+        raise UserError(f"{path}: the picture of shape {image.shape} could not be encoded as PNG; write a smaller one")
     with atomic_write(path) as temporary:
         temporary.write_bytes(data.tobytes())
 

@@ -208,8 +208,11 @@ class Recorder:
 
 
 def _frames(reports: Sequence[StepReport]) -> dict[str, np.ndarray]:
-    """Return the values that only a continued run reads: the frames (n, 3, 3) of all contacts and their gaps (n,) at
-    the starts of the steps, m; and the drives (d, N, 3), m/s, of the steps ``drive_row`` (d,) of the part."""
+    """Return the arrays that only a continued run reads.
+
+    These are the frames (n, 3, 3) of all contacts, their gaps (n,) m at the start of each step, the drives (d, N, 3)
+    m/s, and the numbers ``drive_row`` (d,) of their steps in the part.
+    """
     driven = [(row, report.drive) for row, report in enumerate(reports) if report.drive is not None]
     return {
         "contact_axes": np.concatenate([report.contacts.axes for report in reports]),

@@ -147,7 +147,8 @@ class _Builder:
         """Raise ``UserError`` for a body without an upright pose; ``missing`` names the missing part in the message."""
         kind = self.stance.base()
         if kind in (SupportKind.LYING, SupportKind.ROUND_BASE):
-            raise UserError(f"{self.name}: the body stands on {kind.value} and has {missing}; walk or jump")
+            posture = "lies along the ground" if kind is SupportKind.LYING else f"stands on {kind.value}"
+            raise UserError(f"{self.name}: the body {posture} and has {missing}; walk or jump")
 
     def whole(self) -> BodyPart:
         """Return the whole body."""

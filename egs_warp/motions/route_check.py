@@ -29,6 +29,6 @@ def check_route(stance: Stance, planar_poses: np.ndarray) -> None:
         level[2] = slope @ level[:2]
         rise = stance.surface_height_above(ground.world(level)) / body.height
         if abs(rise) > MAX_STEP_HEIGHT:
-            where = f"{x / body.height:.2f} ahead and {y / body.height:.2f} to the left"
+            where = f"{x / body.height:.2f} body heights ahead and {y / body.height:.2f} to the left"
             obstacle = f"the surface there is {abs(rise):.2f} body heights {'higher' if rise > 0.0 else 'lower'}"
             raise TargetError(f"walk: the path leads over a step, {where}: {obstacle}; walk around it, or jump or hop")

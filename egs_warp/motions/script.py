@@ -211,7 +211,7 @@ def _from_piece(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRe
             raise UserError(f"{where} ({piece!r}): nothing after +; name a gesture: {', '.join(_GESTURES)}")
         starts = [word.partition("=")[2] for word in words if word.startswith("at=")]
         if len(starts) > 1:
-            raise UserError(f"{where} ({piece!r}): at is given twice; give it once")
+            raise UserError(f"{where} ({piece!r}): at= is given twice; give it once")
         rest = " ".join(word for word in words if not word.startswith("at="))
         layers.append(_layer(_from_words(rest, {}, where), starts[0] if starts else 0.0, f"{where} ({piece!r})"))
     return replace(_from_words(first.strip(), defaults, where), layers=tuple(layers))

@@ -263,7 +263,7 @@ def _steered(
     """Return a steered walk. Raises ``TargetError`` if its ``goal`` (2,) m is in an obstacle or in a body."""
     height = stance.body.height
     if goal is not None:
-        where = f"{goal[0] / height:.2f} ahead and {goal[1] / height:.2f} to the left"
+        where = f"{goal[0] / height:.2f} body heights ahead and {goal[1] / height:.2f} to the left"
         if is_blocked(stance, goal, radius_of(stance.ground.local(stance.standing))):
             raise TargetError(f"{what}: there is an obstacle at the target, {where}; give a target beside it")
         # Only props stay where they are.

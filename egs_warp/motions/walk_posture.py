@@ -205,8 +205,11 @@ def rocking_reason(stance: Stance) -> str:
 
 
 def _missing_leg_lengths(stance: Stance) -> list[tuple[float, float]]:
-    """Return the length and the required length in metres of each leg that is too short to swing. On few feet, a swing
-    is a fall that the next footprint catches, so that a leg that is wider than long is too short."""
+    """Return the length and the required length in metres of each leg that is too short to swing.
+
+    A body on few feet falls during a swing until the swinging foot lands. There, a leg that is shorter than its sole is
+    wide is too short as well.
+    """
     feet, standing = stance.feet(), stance.ground.local(stance.standing)
     few = len(feet) < MAX_SEQUENTIAL_FEET
     required = [

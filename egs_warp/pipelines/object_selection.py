@@ -96,7 +96,8 @@ def read_object(
             specs.append(_parse_location(text, posed, view, names))
     if len(specs) > 1:
         raise UserError(
-            f"{names.object}: {len(specs)} objects, {values[0]} and others; give one, and clicks +u,v@photo"
+            f"{names.object}: {len(specs)} objects, {values[0]} and others; give one, and correct it with clicks"
+            " +u,v@photo"
         )
     if mask_model is not None:
         if specs or not clicks:
@@ -123,7 +124,7 @@ def picked_object(
             continue
         if len(texts) > 1:
             what = (names or SelectionNames()).object
-            raise UserError(f"{what}: {text} is a whole object; leave the other {len(texts) - 1} values out")
+            raise UserError(f"{what}: {text} is a whole object; give no other value")
         return read_picked(match[1], cloud).named(match[2], match[1])
     return None
 

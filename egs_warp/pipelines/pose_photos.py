@@ -145,7 +145,7 @@ def pose_photos(
             for part in _WRITES:
                 os.replace(work / part, run.folder(part))
         except OSError as error:
-            raise UserError(f"{out}: cannot be written ({error.strerror}); choose another place") from error
+            raise UserError(f"{out}: cannot be written ({error.strerror}); choose another path") from error
         run.finish()
     posed = {image.name for image in model.images.values() if image.has_pose}
     return PoseResult(

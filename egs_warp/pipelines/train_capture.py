@@ -143,8 +143,8 @@ def train(
     """
     if iterations < 1 or (max_gaussians is not None and max_gaussians < 100) or not 0 <= sh_degree <= 3:
         raise UserError(
-            f"train: {iterations} iterations, {max_gaussians} Gaussians and SH degree {sh_degree};"
-            " give at least 1, at least 100, and 0 to 3"
+            f"train: iterations={iterations}, max_gaussians={max_gaussians}, sh_degree={sh_degree};"
+            " give at least 1 iteration, at least 100 Gaussians and a degree from 0 to 3"
         )
     if seed < 0:
         raise ArgumentError("seed", "give a whole number of at least 0", value=seed)

@@ -126,7 +126,7 @@ class _BodyPrims:
         self._weight = float(t.node_mass.sum() * np.linalg.norm(t.gravity))
         self.material = define_material(stage, path, t)
         """Material of the body."""
-        # A prop is stiff, and its single tetrahedron does not mesh its volume.
+        # A prop is stiff, and its single tetrahedron does not have its shape.
         self._soft_body = define_body(stage, path, t, self.material) if len(t.tets) > 1 else None
 
     def write_frame(self, index: int, *, is_first: bool) -> None:
@@ -213,7 +213,7 @@ def _set_points(shape: Any, points: np.ndarray, code: Any, Vt: Any, *, width: fl
 
 def _extent(points: np.ndarray, margin: float) -> np.ndarray:
     if len(points) == 0:
-        # The empty extent of USD.
+        # USD's representation of an empty extent.
         return np.finfo(np.float32).max * np.array([[1.0] * 3, [-1.0] * 3], np.float32)
     return np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin]).astype(np.float32)
 

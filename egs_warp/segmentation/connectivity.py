@@ -17,7 +17,7 @@ from egs_warp.geometry.unique_rows import distinct_rows
 _ARM = 1.5
 """Half-length of a Gaussian along each axis, in standard deviations; limited to four cells."""
 _FOURTH = 4
-"""Rank of the nearest neighbour whose distance measures how sparse a capture is."""
+"""Number, counted from 1, of the nearest neighbour whose distance measures how sparse a capture is."""
 _MAX_GAUSSIANS = 200_000
 """Maximum number of Gaussians, spread evenly, from which the sparsity is measured."""
 

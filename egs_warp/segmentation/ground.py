@@ -60,7 +60,7 @@ _PATCH = 0.05
 
 @dataclass(frozen=True)
 class MeasuredGround:
-    """Heights of the ground about an object, and their quality."""
+    """Heights of the ground around an object, and their quality."""
 
     field: HeightField
     """Heights of the ground, scene units. Unseen ground, including the ground under the object, is the harmonic

@@ -28,7 +28,7 @@ _MAX_WIDTH = 0.05
 
 @dataclass(frozen=True)
 class ClicksInPhotos(ObjectSpec):
-    """A point or clicks in a capture with photos that show the object."""
+    """An object that is described by a point or clicks, with the capture prepared from photos that show it."""
 
     surface: SurfaceGraph | None = None
     """The capture prepared for the clicks."""

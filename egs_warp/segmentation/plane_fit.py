@@ -138,7 +138,7 @@ def _gather(views: Sequence[PlaneView], random: np.random.Generator) -> _Pixels:
     depth = np.concatenate(depths)
     if len(depth) < _MIN_PIXELS:
         raise UserError(
-            f"plane: only {len(depth)} pixels inside the masks show anything, fewer than {_MIN_PIXELS}; "
+            f"plane: only {len(depth)} pixels inside the masks have a depth, fewer than {_MIN_PIXELS}; "
             "mark a larger part of the plane, or check the cameras"
         )
     number = np.concatenate(first)

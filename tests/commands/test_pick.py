@@ -50,7 +50,7 @@ def test_segment_takes_a_picked_object_and_its_plane(scene: Path, tmp_path: Path
     ("values", "message"),
     [
         (["picked.json:bell"], "it has no object 'bell' (did you mean 'ball'?); it has ball, upper half"),
-        (["picked.json", "0,0,1"], "is a whole object; leave the other 1 values out"),
+        (["picked.json", "0,0,1"], "is a whole object; give no other value"),
         (["absent.json"], "make it with egs-warp pick"),
         (["cameras.json"], "not a file of egs-warp pick"),
     ],

@@ -218,6 +218,6 @@ def test_child_opacities_follow_the_split_rules() -> None:
     np.testing.assert_array_equal(outer, other)
     assert outer[0] == middle[0] == 0.0 and (np.diff(outer) > 0.0).all() and (np.diff(middle) > 0.0).all()
     assert (outer[1:] < middle[1:]).all() and (middle[1:] < opacities[1:]).all()
-    # At the parent's centre, faint children add up to the parent to 3.5 %: 2 outer exp(-1) + middle.
+    # At the parent's centre, the sum of faint children, 2 outer exp(-1) + middle, is within 3.5 % of the parent.
     faint = slice(1, 9)
     np.testing.assert_allclose(2.0 * outer[faint] * np.exp(-1.0) + middle[faint], opacities[faint], rtol=0.035)

@@ -115,8 +115,8 @@ def test_new_gaussians_have_the_gloss_of_the_floor_but_their_own_colour(
 
 @pytest.mark.slow
 def test_training_reduces_the_error_to_the_painted_image() -> None:
-    """Seen face-on, the error to the painted image decreases by at least 30 %, and the means stay the same. The result
-    without training is deterministic."""
+    """Seen face-on, the difference from the painted image decreases by at least 30 %, and the means stay the same. The
+    result without training is deterministic."""
     truth, hole = floor(), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     damaged = holed(truth, hole)
 

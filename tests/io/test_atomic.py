@@ -43,7 +43,7 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_file(tmp_path: Path) -> None
     with pytest.raises(UserError) as caught, atomic_write(target) as temporary:
         temporary.write_text("ne")
         raise OSError(28, "No space left on device")
-    assert str(caught.value) == f"{target}: cannot be written (No space left on device); choose another place"
+    assert str(caught.value) == f"{target}: cannot be written (No space left on device); choose another path"
     assert target.read_text() == "old"
     assert os.listdir(tmp_path) == ["a.json"]
 

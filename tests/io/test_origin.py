@@ -76,7 +76,7 @@ def test_captures_beside_each_other_share_an_origin(tmp_path: Path) -> None:
     assert thing.origin is not None and background.origin is not None and (thing.origin != background.origin).any()
     steps = background.cloud_aligned_with(thing).means.numpy() - thing.means.numpy()
     np.testing.assert_allclose(steps, np.tile([40.0, 30.0, 0.0], (200, 1)), atol=1e-5)
-    # Parts that segment wrote have no origin, and belong to a capture that has one.
+    # Parts that ``egs-warp segment`` wrote have no origin, but belong to a capture that has one.
     np.testing.assert_array_equal(near.cloud_aligned_with(thing).means.numpy(), near.means.numpy())
 
 

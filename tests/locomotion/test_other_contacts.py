@@ -32,7 +32,7 @@ def test_other_contacts_keep_their_modes(velocities: tuple[np.ndarray, np.ndarra
     full = (rows @ np.concatenate([x[:ACTIVATIONS], forces.ravel()]) + offset).reshape(-1, 3)
     reduced_rows, reduced_offset = others.contact_rows(rows, offset)
     assert (reduced_rows @ x + reduced_offset).reshape(-1, 3) == pytest.approx(full[RETAINED], abs=1e-12)
-    # The regularisation of the equations of the forces leaves small velocities.
+    # The regularisation of the force equations leaves small velocities.
     assert full[[1, 4]] == pytest.approx(0.0, abs=1e-5)
     assert full[3, 0] == pytest.approx(0.0, abs=1e-5)
     assert forces[3, 1:] == pytest.approx([FRICTION * forces[3, 0], 0.0])

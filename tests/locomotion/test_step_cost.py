@@ -1,4 +1,4 @@
-"""The cost of a step, against finite differences over positions and velocities (Eq. 13)."""
+"""The quadratic cost of a step (Eq. 13), compared with direct evaluation and finite differences."""
 
 from __future__ import annotations
 

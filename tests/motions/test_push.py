@@ -74,8 +74,8 @@ def test_steps_share_out_all_of_a_push(push: Push, dt: float) -> None:
 
 
 def test_a_push_has_its_momentum_and_its_lever_arm(standing_block: CoarseCreature) -> None:
-    """An impulse of 1 m sqrt(g H) gives the whole body the velocity sqrt(g H). A push near the top or the bottom
-    rotates the body, a push of all nodes does not."""
+    """A push of 1 gives a body of mass M the momentum M sqrt(g H). A push near the top or the bottom rotates the body;
+    a push of all nodes does not."""
     place, body = standing_block.place, standing_block.place.body
     for height in (None, 0.9, 0.1):
         kick = PushKicks(place, [Push(0.0, 0.3 * LEFT, height)])(0.0, DT)

@@ -129,7 +129,7 @@ def test_motions_along_paths_are_parsed(tmp_path: Path) -> None:
         ),
         ("walk + nod x2", "motion 1 ('walk + nod x2'): nod on top of a motion cannot be repeated; add it once more"),
         ("walk + nod at=-1", "motion 1 ('walk + nod at=-1'): at -1: give a number of seconds from 0 to 60"),
-        ("walk + nod at=1 at=2", "motion 1 ('walk + nod at=1 at=2'): at is given twice; give it once"),
+        ("walk + nod at=1 at=2", "motion 1 ('walk + nod at=1 at=2'): at= is given twice; give it once"),
         ("walk + ", "motion 1 ('walk +'): nothing after +; name a gesture: nod, shake, look around"),
         ("fly", f"motion 1: unknown motion 'fly'; known motions are: {KNOWN}"),
         ("jump,", "motion 2: nothing between two commas; name a motion: jump, hop, twist, walk, walk to"),

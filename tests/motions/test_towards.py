@@ -60,7 +60,7 @@ def test_a_walk_to_a_prop_is_refused_with_one_line() -> None:
     stance = initial_stance(creature)
     nodes = box.body.mesh.nodes + 1.5 * stance.ground.axes[0]
     king = OtherBody(box.body, lambda: BodyState(nodes, np.zeros_like(nodes)), box.geometry)
-    with pytest.raises(UserError, match=r"king is at the target, 1.50 ahead and 0.00 to the left"):
+    with pytest.raises(UserError, match=r"king is at the target, 1.50 body heights ahead and 0.00 to the left"):
         script_among("walk to 1.5,0", {"king": king}, stance).check(stance)
     script_among("walk to 3,0", {"king": king}, stance).check(stance)
     # Targets of later motions are checked where these start.

@@ -282,7 +282,7 @@ def test_hoops_make_no_axial_torque_between_halves(column_muscles: MuscleSet) ->
 
 def test_automatic_muscles_of_a_column(column_body: SoftBody, column_muscles: MuscleSet) -> None:
     """A column gets fibres of every kind, each with a mirrored partner, within the budget of segments. The longitudinal
-    fibres are distributed all around, and two calls give the same bits."""
+    fibres are distributed all around, and two calls give bitwise equal results."""
     muscles = column_muscles
     assert set(muscles.fibre_kinds) == set(FibreKind) - {FibreKind.USER}
     assert 60 <= muscles.segment_count <= 112

@@ -1,4 +1,4 @@
-"""View direction of a video: from the front of the face, unless something blocks the view."""
+"""View direction of a video: 35 degrees from the facing direction, unless something blocks the view."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ def test_views_that_cannot_be_fitted_are_reported() -> None:
     depth = plane_depth(TRUTH, camera)
     with pytest.raises(UserError, match=r"mask of view 0 is \(50, 40\) pixels, its camera's picture \(120, 90\)"):
         fit_plane([PlaneView(camera, depth, np.ones((40, 50), bool))])
-    with pytest.raises(UserError, match="only 0 pixels inside the masks show anything, fewer than 30"):
+    with pytest.raises(UserError, match="only 0 pixels inside the masks have a depth, fewer than 30"):
         fit_plane([PlaneView(camera, np.zeros_like(depth), np.ones_like(depth, bool))])
     with pytest.raises(UserError, match="there are no views"):
         fit_plane([])

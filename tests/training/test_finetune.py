@@ -205,7 +205,7 @@ def test_photos_become_a_capture(data_dir: Path) -> None:
 def test_impossible_training_is_refused(tmp_path: Path) -> None:
     from egs_warp.pipelines.train_capture import train
 
-    with pytest.raises(UserError, match="train: 0 iterations, 50000 Gaussians and SH degree 3; give at least 1"):
+    with pytest.raises(UserError, match="train: iterations=0, max_gaussians=50000, sh_degree=3; give at least 1"):
         train(tmp_path, iterations=0)
     (tmp_path / "transforms.json").write_text(
         '{"camera_angle_x": 0.7, "w": 8, "h": 8, "frames": [{"file_path": "r_0.png", '

@@ -1,4 +1,4 @@
-"""The first steps of a training compare reduced images."""
+"""The first steps of a training run compare reduced images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_images_become_finer_and_small_ones_are_not_reduced() -> None:
     assert large.factors == {1, 2, 4}
     assert small.factors == {1}
     assert small.factor(0) == 1
-    # A training without a schedule stores no reduced images.
+    # A schedule of zero steps has no reduced images.
     assert ResolutionSchedule(render_views(cloud, ring(1, 256)), 0).factors == {1}
 
 

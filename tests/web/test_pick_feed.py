@@ -180,7 +180,7 @@ def test_the_ground_and_the_front_are_dragged(chromium: Any, tmp_path: Path):
         changed(page, lambda: drag("front", 10, 25))
         front = session.state.pick.front
         assert front is not None and abs(front @ before.plane.normal) < 1e-6
-        # It was turned towards the viewer.
+        # The front was turned towards the viewer.
         assert front @ session.source.frame.axes @ np.array([0.0, -1.0, 0.0]) > 0.1
         # Dragging a handle does not turn the camera.
         assert page.evaluate("egs.viewers[0].camera.position.toArray()") == pytest.approx(eye, abs=1e-6)

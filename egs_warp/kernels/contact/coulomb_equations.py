@@ -196,7 +196,7 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, reg
             pull = wp.sqrt(first * first + second * second)
             radius = contacts.friction * wp.max(forces[n], real(0.0))
             if pull > radius:
-                # Sliding: 1 - share (1 - d d^T) (1 - rate G) - friction d by the normal force.
+                # Sliding: 1 - share (1 - d d^T) (1 - rate G), G the Delassus operator; column of f_n: -friction d.
                 share = radius / pull
                 d = wp.vec2d(first / pull, second / pull)
                 mine = d[row - n - 1]

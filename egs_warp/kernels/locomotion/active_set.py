@@ -32,7 +32,7 @@ OPTIMUM_FOUND, INFEASIBLE, NUMERICAL_FAILURE = wp.constant(0), wp.constant(1), w
 WRONG_SIGN_TOLERANCE = wp.constant(real(1e-9))
 """A multiplier below minus this fraction of the largest multiplier has the wrong sign."""
 REDUNDANCY_TOLERANCE = wp.constant(real(1e-12))
-"""Shift of the diagonal of the products of active rows. The matrix is singular if rows are redundant."""
+"""Shift of the diagonal of the Gram matrix of the active rows, which is singular if rows are redundant."""
 BOUND_TOLERANCE = wp.constant(real(1e-7))
 """Maximum distance of an active row from its bound. A row that depends on other active rows can be further away."""
 DEPENDENCE_TOLERANCE = wp.constant(real(1e-9))
