@@ -175,7 +175,10 @@ def test_bad_json(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("tree", "expected"),
     [
-        ({"lods": {"0": {"file": 4, "offset": 0, "count": 1}}}, "refers to file 4, counted from 0, but lists only 1"),
+        (
+            {"lods": {"0": {"file": 4, "offset": 0, "count": 1}}},
+            "lod-meta.json refers to file 4, counted from 0, but lists only 1",
+        ),
         ({"lods": {"0": {"file": 0, "offset": -1, "count": 1}}}, "malformed leaf in lod-meta.json"),
         ({"children": 5}, "malformed tree in lod-meta.json"),
         ({"children": [[]]}, "malformed tree in lod-meta.json"),
