@@ -46,6 +46,15 @@ def ssim_kernels(module: str, lanes: int) -> SsimKernels:
     """)
     def store_first(values: wp.array[wp.float32], at: wp.int32, count: wp.int32, value: numbers): ...
 
+    @wp.func
+    def blurred(values: wp.array[wp.float32], window: wp.array[wp.float32], at: wp.int32, step: wp.int32) -> numbers:
+        """Return the mean of floats ``step`` apart around ``at``, weighted with the window."""
+        total = numbers()
+        # Static bounds unroll the loop, which keeps the total in a register.
+        for k in range(wp.static(-REACH), wp.static(REACH + 1)):
+            total += window[k + REACH] * load(values, at + k * step)
+        return total
+
     @wp.kernel(**options)
     def blur_products(
         first_row: wp.int32,
@@ -105,18 +114,11 @@ def ssim_kernels(module: str, lanes: int) -> SsimKernels:
         thread = first_row + wp.tid()
         lane = (thread % blocks) * wp.static(lanes)
         at = PADDING + (REACH + thread // blocks) * pitch + lane
-        ma = numbers()
-        mb = numbers()
-        aa = numbers()
-        bb = numbers()
-        ab = numbers()
-        for k in range(wp.static(-REACH), wp.static(REACH + 1)):
-            share = window[k + REACH]
-            ma += share * load(mean_a_in, at + k * pitch)
-            mb += share * load(mean_b_in, at + k * pitch)
-            aa += share * load(aa_in, at + k * pitch)
-            bb += share * load(bb_in, at + k * pitch)
-            ab += share * load(ab_in, at + k * pitch)
+        ma = blurred(mean_a_in, window, at, pitch)
+        mb = blurred(mean_b_in, window, at, pitch)
+        aa = blurred(aa_in, window, at, pitch)
+        bb = blurred(bb_in, window, at, pitch)
+        ab = blurred(ab_in, window, at, pitch)
         c1 = numbers(C1)
         c2 = numbers(C2)
         both = wp.cw_mul(ma, mb)
@@ -154,17 +156,9 @@ def ssim_kernels(module: str, lanes: int) -> SsimKernels:
         """Blur the derivatives along the rows. The window is symmetric, so the blur is its own transpose."""
         thread = first_row + wp.tid()
         at = PADDING + (REACH + thread // blocks) * pitch + (thread % blocks) * wp.static(lanes)
-        mean = numbers()
-        square = numbers()
-        product = numbers()
-        for k in range(wp.static(-REACH), wp.static(REACH + 1)):
-            share = window[k + REACH]
-            mean += share * load(by_mean, at + 3 * k)
-            square += share * load(by_square, at + 3 * k)
-            product += share * load(by_product, at + 3 * k)
-        store(by_mean_out, at, mean)
-        store(by_square_out, at, square)
-        store(by_product_out, at, product)
+        store(by_mean_out, at, blurred(by_mean, window, at, 3))
+        store(by_square_out, at, blurred(by_square, window, at, 3))
+        store(by_product_out, at, blurred(by_product, window, at, 3))
 
     @wp.kernel(**options)
     def gradient(
@@ -182,14 +176,9 @@ def ssim_kernels(module: str, lanes: int) -> SsimKernels:
         """Compute the derivative of the sum of SSIM with respect to the transformed render."""
         thread = first_row + wp.tid()
         at = PADDING + (REACH + thread // blocks) * pitch + (thread % blocks) * wp.static(lanes)
-        mean = numbers()
-        square = numbers()
-        product = numbers()
-        for k in range(wp.static(-REACH), wp.static(REACH + 1)):
-            share = window[k + REACH]
-            mean += share * load(by_mean_in, at + k * pitch)
-            square += share * load(by_square_in, at + k * pitch)
-            product += share * load(by_product_in, at + k * pitch)
+        mean = blurred(by_mean_in, window, at, pitch)
+        square = blurred(by_square_in, window, at, pitch)
+        product = blurred(by_product_in, window, at, pitch)
         x = load(toned, at)
         y = load(photo, at)
         store(by_similarity_out, at, mean + 2.0 * wp.cw_mul(x, square) + wp.cw_mul(y, product))
