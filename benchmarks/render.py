@@ -362,7 +362,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--old", type=Path, help="checkout of commit f1c9b54, to be timed on a CPU")
     options = parser.parse_args(arguments)
-    points = dict(np.load(data_folder() / "points" / "garden.npz"))
+    with np.load(data_folder() / "points" / "garden.npz") as arrays:
+        points = dict(arrays)
     repeats = 10 if options.quick else 30
     rows: list[Row] = []
     table = Table(gaussians="9d", size="9s", what="<16", renderer="<12", ms="9.3f")

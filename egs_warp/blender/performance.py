@@ -265,7 +265,8 @@ def _camera(creature: dict[str, np.ndarray]) -> FilmCamera:
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as data:
+        # np.load(path) would leave the file open if it is a broken archive.
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
             return dict(data)
     except FileNotFoundError as error:
         raise ReadError(f"{path}: is missing; choose the folder of a finished run of egs-warp animate") from error

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import runpy
 import shutil
 import sys
+import warnings
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -101,4 +103,8 @@ def test_problems_are_one_line(reader: ModuleType, run_folder: Path, tmp_path: P
         np.savez(tmp_path / "creature.npz", **{name: data[name] for name in data if name != "carriers"})
     assert "creature.npz: was written by an earlier version; write a bundle" in problem(tmp_path)
     (tmp_path / "creature.npz").write_bytes(b"PK\x03\x04 cut off")
-    assert "creature.npz: cannot be read" in problem(tmp_path)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert "creature.npz: cannot be read" in problem(tmp_path)
+        gc.collect()
+    assert not [warning for warning in caught if warning.category is ResourceWarning]
