@@ -1,4 +1,4 @@
-"""Built-in scenes, generated procedurally, to try every stage of the paper without a download.
+"""Built-in scenes, generated procedurally, to try every stage of the paper without downloading data.
 
 In: a name and a seed. Out: a Gaussian cloud, its plane and a camera.
 """

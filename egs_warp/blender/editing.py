@@ -43,7 +43,7 @@ def add_rest_objects(performance: Performance, root: bpy.types.Object, collectio
 
 
 def write_muscles(path: Path, root: bpy.types.Object, performance: Performance) -> int:
-    """Write the file of muscles; return the number of its fibres.
+    """Write the curves as a file of muscles; return the number of fibres.
 
     Raises:
         ValueError: as for ``muscles_as_json``.
@@ -82,7 +82,8 @@ def write_cage(path: Path, root: bpy.types.Object, performance: Performance) -> 
 
 
 def muscles_as_json(root: bpy.types.Object, performance: Performance) -> str:
-    """Return the text of a file of muscles: each spline of a curve is a fibre, each control point ends a segment.
+    """Return the text of a file of muscles: each spline of a curve is a fibre, and each of its control points ends a
+    segment.
 
     Raises:
         ValueError: the creature is from a bundle, there is no curve, or a spline has fewer than two points.

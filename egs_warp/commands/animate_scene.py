@@ -1,4 +1,5 @@
-"""``egs-warp animate SCENE --object a=... --object b=...``: several objects of a scene as the bodies of a world."""
+"""``egs-warp animate SCENE --object a=... --object b=...``: animate several objects of a scene as the bodies of a
+world."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ _FLAGS = (
     *("object", "cameras", "view", "mask_model", "up", "flat", "straddling", "inpainter", "trust", "no_inpaint"),
     *("metres_per_unit", "friction", "motion", "prop", "collision_mesh", "save_collision_mesh"),
 )
-"""Flags that apply to several objects of a scene, apart from those of a world."""
+"""Flags that apply to several objects of a scene, in addition to the flags of a world."""
 
 
 def named_objects(values: Sequence[str] | None) -> dict[str, tuple[str, ...]]:

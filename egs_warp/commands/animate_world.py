@@ -85,7 +85,7 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
     start_device(args.device)
     with run_folder(args.out, command=ANIMATE_WORLD, overwrite=args.overwrite, resume=args.resume) as folder:
         folder.begin_with(lambda: write_config(folder.file(NAME), args, args.parser))
-        # The parts of a scene are written at once, so that a later error does not lose minutes of work.
+        # Write the parts of a scene immediately, so that a later error does not discard minutes of work.
         progress = SceneProgress(
             print_note,
             lambda name, scene: write_object(name, scene, folder),

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 TRANSPARENT = "transparent"
 """Value of ``--background`` for a transparent video."""
 COLOURS = "r,g,b from 0 to 1, #rrggbb, or a name"
-"""Forms of a colour, for messages."""
+"""Accepted forms of a colour, for messages."""
 
 
 def add_camera_flags(
