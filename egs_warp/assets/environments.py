@@ -59,7 +59,7 @@ def chess_board(*, squares: int = 8, seed: int = 1, device: str | None = None) -
 
 
 def bedroom(*, seed: int = 1, device: str | None = None) -> GaussianCloud:
-    """Create oak planks with a woven rug on z = 0, and two walls with skirting boards in the planes y = 2.4 and x =
+    """Create a floor of oak planks with a woven rug on z = 0, and walls with skirting boards at y = 2.4 and x =
     -2.6."""
     random = np.random.default_rng(seed)
     spacing = 0.035

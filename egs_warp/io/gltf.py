@@ -28,26 +28,26 @@ from egs_warp.io.text import parse_json
 
 EXTENSION = "KHR_gaussian_splatting"
 _SPZ = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
-"""Extensions for compression as .spz: the name in the draft, and the name in earlier files."""
+"""Extensions for splats compressed as .spz: the name in the draft, and the name in earlier files."""
 _SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
-"""Extension of a draft of 2025, which is used instead of ``EXTENSION``."""
+"""Extension of a draft of 2025 that is used instead of ``EXTENSION``."""
 _QUANTIZED = "KHR_mesh_quantization"
 _READ = (EXTENSION, *_SPZ, _SPZ_ALONE, INSTANCING, _QUANTIZED)
 _SURFACES = ("KHR_materials_", "EXT_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
-"""Prefixes of extensions that only change the appearance of meshes."""
+"""Prefixes of the names of extensions that only change the appearance of meshes."""
 _MAX_COPIES = 1 << 21
-"""Maximum number of Gaussians that instances may add to the Gaussians stored in the file."""
+"""Maximum number of Gaussians that instances may add to those stored in the file."""
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 """Magic number of a .glb, and types of its two chunks."""
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _HALF_TURN = np.diag([-1.0, 1.0, -1.0])
-"""Half a turn about y: from the axes of .spz (right, up, back) to left, up, front."""
+"""Rotation by half a turn about y, from the axes of .spz (right, up, back) to left, up, front."""
 _Y_UP = np.array([0.0, 1.0, 0.0])
 
 
 def is_glb(data: bytes) -> bool:
-    """Return True if ``data`` begins like a binary glTF file."""
+    """Return True if ``data`` begins like a binary glTF file (.glb)."""
     return data[:4] == b"glTF"
 
 
@@ -100,7 +100,7 @@ def _decode(text: bytes, source: Path, read: Callable[[int, str | None], bytes |
     try:
         tree = parse_json(text.decode("utf-8"), source)
         return _Asset(source, tree, read).capture()
-    # An untrusted tree may deviate from glTF anywhere; all these errors are handled here.
+    # In an untrusted file, the JSON tree may deviate from glTF anywhere; all resulting errors are handled here.
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         if isinstance(error, UserError):
             raise
@@ -143,8 +143,8 @@ class _Asset:
     """Function that returns the bytes of a buffer by its index and URI; None if the file does not contain it."""
 
     def capture(self) -> RawCapture:
-        """Return all splats of the file: in the axes of their meshes if all meshes have the same transform, a rotation
-        and scale, otherwise in the axes of the scene."""
+        """Return all splats of the file. They are in the axes of their meshes if all meshes have the same transform and
+        it is a similarity; otherwise they are in the axes of the scene."""
         self._check_required()
         meshes = self.tree.get("meshes", [])
         splats = [[p for p in mesh["primitives"] if _is_splats(p)] for mesh in meshes]
@@ -241,8 +241,8 @@ class _Asset:
     def _packed(self, primitive: dict[str, Any], packed: dict[str, Any]) -> _Splats:
         """Decode a .spz.
 
-        Its axes are the axes of the mesh or, as the draft demands and few tools implement, these axes rotated about y.
-        The bounds of ``POSITION`` decide between the two.
+        Its axes are the axes of the mesh or, as the draft requires but few tools implement, the axes of the mesh
+        rotated about y. The bounds of ``POSITION`` decide between the two.
         """
         view = self.tree["bufferViews"][packed["bufferView"]]
         start, size = view.get("byteOffset", 0), view["byteLength"]

@@ -1,4 +1,4 @@
-"""Limits for untrusted files, checked before anything is allocated.
+"""Limits for untrusted files, checked before memory is allocated.
 
 The sizes that a file declares (Gaussians, pixels, inflated bytes) are compared with the size of the file and with the
 limits of this module; docs/reliability.md lists them.
@@ -26,12 +26,12 @@ MAX_SIDE = 1 << 15
 MAX_COORDINATE = 1e12
 """Maximum coordinate, scene units."""
 MIN_LOG_SCALE = -100.0
-"""Minimum logarithm of a standard deviation; its exponential is nearly 0 in single precision."""
+"""Minimum logarithm of a standard deviation, whose exponential is nearly 0 in single precision."""
 FREE_GAUSSIANS = 1 << 16
-"""Number of Gaussians that a packed capture may declare whatever its size."""
+"""Number of Gaussians that a packed capture may declare regardless of its size."""
 INFLATION = 4
-"""Maximum ratio of inflated to packed bytes of a picture in a zip, in addition to ``FREE_BYTES``; WebP is hardly
-compressible."""
+"""Maximum ratio of inflated to packed bytes of a picture in a zip, beyond ``FREE_BYTES``. It is small, because WebP is
+hardly compressible."""
 FREE_BYTES = 1 << 16
 
 
@@ -57,7 +57,7 @@ def picture_size(data: bytes | Path, what: str) -> tuple[int, int] | None:
     """
     from PIL import Image
 
-    # Pillow would warn of large pictures below this limit.
+    # Pillow would print a warning for large pictures below this limit.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -71,8 +71,8 @@ def picture_size(data: bytes | Path, what: str) -> tuple[int, int] | None:
 
 
 def read_bytes(path: Path | str, *, at_most: int | None = None, missing: str = "check the path") -> bytes:
-    """Return the content of a regular file. Raises ``UserError`` for anything else, such as a pipe or a device, which
-    may have no end.
+    """Return the content of a regular file. Raises ``UserError`` for anything else, such as a pipe or a device, whose
+    content may be endless.
 
     Args:
         path: the file.

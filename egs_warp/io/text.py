@@ -11,7 +11,7 @@ from egs_warp.errors import UserError
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 
 _EXACT_DIGITS = 15
-"""Maximum number of digits of integers that are always exact as floats."""
+"""Maximum number of digits at which every integer is exact as a float."""
 
 
 def read_text(path: Path | str) -> str:
@@ -40,8 +40,8 @@ def decimal_number(word: str) -> float:
 
 
 def whole_number(digits: str) -> int | float:
-    """Parse an integer. More than ``_EXACT_DIGITS`` digits give a float, possibly infinite, outside every valid
-    range."""
+    """Parse an integer. An integer with more than ``_EXACT_DIGITS`` digits becomes a float, possibly infinite, which is
+    outside every valid range."""
     return int(digits) if len(digits) <= _EXACT_DIGITS else float(digits)
 
 

@@ -43,7 +43,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class DrivePlan:
-    """Sequence of commands, each valid until the time of the next; the last command is zero."""
+    """Sequence of commands, each valid until the time of the next one; the last command is zero."""
 
     times: tuple[float, ...]
     """Times of the commands in seconds from the start, increasing."""
@@ -87,7 +87,7 @@ def read_drive(path: Path) -> DrivePlan:
             row = [float(word) for word in line.replace(",", " ").split()]
         except ValueError:
             if not times and not any(character.isdigit() for character in line):
-                continue  # header line
+                continue  # Skip the header line.
             row = []
         if len(row) != 4:
             raise UserError(f"{where}: {line.strip()[:60]!r}: give four numbers, time,forward,sideways,turn")
