@@ -25,7 +25,7 @@ from egs_warp.io.text import parse_json, read_text
 
 
 class Quantity(Enum):
-    """Quantity that a key sets; components are forward, left and up relative to the body at the start."""
+    """Quantity that a key sets. Its components are forward, left and up relative to the body at the start."""
 
     POSITION = "position"
     """Displacement from the start, body heights."""
@@ -51,7 +51,7 @@ MAX_LENGTH: Mapping[Quantity, float] = {
     Quantity.ORIENTATION: 360.0,
     Quantity.ANGULAR_MOMENTUM: 10.0,
 }
-"""Maximum length of a value in the unit of its quantity; larger values are rejected as typing errors."""
+"""Maximum length of a value, in the unit of its quantity; larger values are rejected as typing errors."""
 _FIELDS = ("time", "part", "quantity", "value", "weight")
 
 
@@ -72,8 +72,8 @@ class Key:
 
 @dataclass(frozen=True)
 class Channel:
-    """All keys of one part and quantity, interpolated by a monotone cubic spline that starts with zero at time 0. The
-    value is constant after the last key."""
+    """All keys of one part and quantity, interpolated by a monotone cubic spline that starts at zero at time 0. After
+    the last key, the value is constant."""
 
     part: str
     quantity: Quantity
@@ -248,5 +248,5 @@ def _key(entry: Mapping[str, Any], where: str) -> Key:
 
 
 def _number(value: Any) -> float:
-    """Return the number, or NaN for anything else."""
+    """Return the value as a number; NaN if it is not a number."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan

@@ -51,7 +51,7 @@ class LandAndPose:
         return self.jump.plan
 
     def planned_com(self, elapsed: float) -> np.ndarray:
-        """Return the planned displacement of the jump, see ``Jump.planned_com``."""
+        """Return the planned displacement of the jump; see ``Jump.planned_com``."""
         return self.jump.planned_com(elapsed)
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> ActOutcome | None:

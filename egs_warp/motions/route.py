@@ -25,7 +25,8 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class StepLimits:
-    """Maximum change of a body's planar pose in one step. A larger rotation reduces the maximum displacement."""
+    """Maximum change of a body's planar pose in one step. In a step with rotation, the maximum displacement is
+    smaller."""
 
     length: float
     """Largest displacement, m."""
@@ -34,12 +35,13 @@ class StepLimits:
     side_fraction: float = 0.0
     """Largest sideways displacement as a fraction of ``length``."""
     faces_travel: bool = True
-    """True if the body turns to the direction in which it moves; a body that rolls or crawls moves in any direction
+    """True if the body turns to the direction in which it moves. A body that rolls or crawls moves in any direction
     without turning."""
 
 
 Route = Callable[[StepLimits], np.ndarray]
-"""Function that returns the planar poses (P+1, 3) before the first and after each step."""
+"""Function that returns the planar poses (P+1, 3) before the first step and after each step, for the limits of a
+step."""
 
 
 def straight_route(distance: float) -> Route:
@@ -67,7 +69,7 @@ def path_route(points: np.ndarray) -> Route:
     necessary.
 
     Raises:
-        UserError: when the route is called, if the path takes more than ``MAX_STEPS`` steps.
+        UserError: if the path takes more than ``MAX_STEPS`` steps; it is raised when the returned route is called.
     """
 
     def planar_poses(limits: StepLimits) -> np.ndarray:
@@ -116,7 +118,7 @@ def read_path(path: Path) -> np.ndarray:
             point = [float(word) for word in line.replace(",", " ").split()]
         except ValueError:
             if not points:
-                continue  # header line
+                continue  # Skip the header line.
             point = []
         if len(point) != 2 or not np.all(np.isfinite(point)):
             raise UserError(f"{path}, line {number}: {line.strip()[:60]!r}: give two numbers, ahead and left")
