@@ -267,8 +267,8 @@ class Act:
         return [] if self.below is None else self.below.notes()
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         self._started = state.time if self._started is None else self._started
         elapsed = state.time - self._started
         active = [layer for layer in self._layers if layer.begin - 0.5 * dt <= elapsed < layer.end - 0.5 * dt]

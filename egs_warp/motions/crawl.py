@@ -163,8 +163,8 @@ class Crawl:
         )
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         body, axes, control, unit = self.body, self.ground.axes, self.control, self.body.time_unit
         local = self.ground.local(state.positions)
         if not self._is_over and (self._round_start is None or state.time - self._round_start >= self._round - 1e-9):

@@ -233,8 +233,8 @@ class Dance:
         return notes
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         self._started = state.time if self._started is None else self._started
         now = state.time - self._started
         step = self._current_step

@@ -188,8 +188,8 @@ class LiveDrive:
         return []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         motion = self._motion
         if isinstance(motion, Stand):
             if not self.command.is_zero and motion.is_at_rest:
@@ -251,8 +251,8 @@ class ScriptedDrive:
         return DriveOutcome(float(moved[0]) / body.height, float(moved[1]) / body.height)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         self._start_time = state.time if self._start_time is None else self._start_time
         elapsed = state.time - self._start_time
         self._is_done = elapsed >= self._plan.seconds - 1e-9

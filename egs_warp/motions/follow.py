@@ -146,7 +146,7 @@ class Follow:
         return reached - np.array(key.value)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of the
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
         previous step."""
         if self._start_time is None:
             self._start_time = state.time

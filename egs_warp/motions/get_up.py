@@ -208,8 +208,8 @@ class GetUp:
         return GetUpOutcome(float(self.tries))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         roll = self._measure(state, report)
         self._advance(state, report, roll)
         if self.phase in (GetUpPhase.CATCH, GetUpPhase.STAND):

@@ -33,7 +33,8 @@ class MotionWorlds(BatchedRecord, ABC):
 
     @abstractmethod
     def step(self, state: ReducedState, dt: float) -> ReducedObjectives:
-        """Return the objectives of the time step of ``dt`` seconds from ``state`` and advance the state machines."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state`` and advance the state
+        machines."""
 
 
 WorldsT = TypeVar("WorldsT", bound=MotionWorlds)
@@ -86,8 +87,8 @@ class JoinedMotion(Generic[WorldsT]):
             one._prepared = objectives.gather(np.array([row]))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         reduced, self._prepared = self._prepared, None
         if reduced is None:
             self.join([self])

@@ -146,7 +146,8 @@ class JumpWorlds(MotionWorlds):
         return self.phase == _REST
 
     def step(self, state: ReducedState, dt: float) -> ReducedObjectives:
-        """Return the objectives of the time step of ``dt`` seconds from ``state`` and advance the state machines."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state`` and advance the state
+        machines."""
         measurement = self.current.measure(state)
         heading = self.heading
         heading.update(measurement.heading + np.where(self.is_airborne, heading.target, 0.0))

@@ -63,8 +63,8 @@ class LandAndPose:
         return self.jump.notes()
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         if self._pose is None and self.jump.is_at_rest:
             stance = self._stance.next_stance(state.positions, report)
             self._pose = Act(stance, [(0.0, landed_pose(stance, self._depth, self._seconds))])

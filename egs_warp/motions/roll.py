@@ -128,8 +128,8 @@ class Roll:
         return RollOutcome(float(np.degrees(angle)))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         body, axes, control = self.body, self.ground.axes, self.control
         self._start_time = state.time if self._start_time is None else self._start_time
         local = self.ground.local(state.positions)

@@ -87,8 +87,8 @@ class Skip:
         return [note for jump in self.jumps for note in jump.notes()]
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         jump = self.jumps[-1]
         result = jump.objectives(state, report, dt)
         if jump.phase not in (JumpPhase.LAND, JumpPhase.REST):

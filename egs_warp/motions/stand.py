@@ -92,7 +92,7 @@ class StandWorlds(MotionWorlds):
         return self.rests
 
     def step(self, state: ReducedState, dt: float) -> ReducedObjectives:
-        """Return the objectives of the time step of ``dt`` seconds from ``state`` and detect rest."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state`` and detect rest."""
         balance, measurement = self.current, self.current.measure(state)
         is_slow = np.linalg.norm(measurement.velocity, axis=1) <= REST_SPEED * self.speed_unit
         operands = self.slow_since, measurement.velocity, state.time, self.speed_unit, self.time_unit
@@ -228,8 +228,8 @@ class StandFor:
         return [f"took {count} capture step{'s' * (count > 1)} to keep its balance"] if count else []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         self._started = state.time if self._started is None else self._started
         self._is_over = state.time - self._started >= self.seconds - 1e-9
         if self._step is not None and self._step.is_at_rest:

@@ -235,8 +235,8 @@ class Steered:
         return SteeringOutcome(self._policy.failures(self._view), float(ahead), float(left), float(minimum))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         self._start_time = state.time if self._start_time is None else self._start_time
         self._view = view = self._look(state, state.time - self._start_time)
         self.neighbours.update(view.time)

@@ -102,8 +102,8 @@ class Turn:
         return notes
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         result = self.jumps[-1].objectives(state, report, dt)
         jump = self.jumps[-1]
         self._remaining_after_jump = (

@@ -196,8 +196,8 @@ class Walk:
         return footfalls(trajectory, self.feet, stride=self._stride(), first=first, last=last)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         body, axes, control = self.body, self.ground.axes, self.control
         local = self.ground.local(state.positions)
         self._advance_phase(local, report, state.time)
