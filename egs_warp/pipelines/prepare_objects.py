@@ -57,8 +57,8 @@ class PreparedObjects:
     __repr__ = short_repr
 
     scenes: Mapping[str, PreparedScene]
-    """The preparation of each object by its name, in the order of the cuts. The capture of each is the background of
-    the one before it."""
+    """The preparation of each object by its name, in the order of the cuts. The input of each preparation is the
+    background of the previous one."""
     planes: Mapping[str, Plane]
     """Plane under each object. All planes are parallel, and objects on the same ground have the same plane."""
     notes: tuple[str, ...]

@@ -195,7 +195,7 @@ class ProcessPool:
         """Send messages from a separate thread, because a worker that is still loading does not read yet."""
         stream = running.process.stdin
         assert stream is not None, "stdin is a pipe"
-        # The end of its output indicates that a worker has died.
+        # Ignore errors while writing: a dead worker is detected by the end of its output.
         with contextlib.suppress(OSError), stream:
             while (message := running.messages.get()) is not None:
                 stream.write(message)

@@ -307,8 +307,8 @@ def _make_body(folder: Path, entry: Mapping[str, Any], device: str | None) -> Cr
 
 
 def _path(entry: Mapping[str, Any]) -> RigidPath:
-    """Return the path of an entry, whose points are given like the place of a body; a key that a point does not have
-    keeps its value."""
+    """Return the path of an entry, whose points are given like the place of a body; a key that a point lacks keeps its
+    value from the previous point."""
     place = {"at": (0.0, 0.0), "above": 0.0, "heading": 0.0} | {
         key: entry[key] for key in ("at", "above", "heading") if key in entry
     }

@@ -23,12 +23,12 @@ from egs_warp.render.tiles import TileLists
 
 @dataclass(frozen=True)
 class CloudGradients:
-    """Gradient of a scalar loss with respect to all inputs of the image."""
+    """Gradient of a scalar loss with respect to all inputs of an image."""
 
     means: wp.array
     """(n,) vec3, with respect to the means."""
     rotations: wp.array
-    """(n,) vec4, with respect to the stored quaternion; orthogonal to it, because its length has no effect."""
+    """(n,) vec4, with respect to the stored quaternions; orthogonal to them, because their length has no effect."""
     log_scales: wp.array
     """(n,) vec3, with respect to the log scales."""
     opacity_logits: wp.array
