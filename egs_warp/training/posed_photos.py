@@ -58,9 +58,8 @@ class PosedPhotos:
 def read_views(posed: Path | str, *, max_side: int | None = None, inverted_masks: bool | None = None) -> PosedPhotos:
     """Read photos and cameras (``read_photo``); photos larger than ``max_side`` pixels are reduced.
 
-    Photos that are missing or unreadable, or do not fit their camera, are excluded. With
-    ``inverted_masks``, the object is black in masks; None detects it (``is_object_black``). Raises ``UserError`` if no
-    photo can be used.
+    Photos that are missing or unreadable, or do not fit their camera, are excluded. With ``inverted_masks``, the object
+    is black in masks; None detects it (``is_object_black``). Raises ``UserError`` if no photo can be used.
     """
     poses = read_posed_images(posed)
     notes = list(poses.notes)

@@ -88,7 +88,7 @@ class LiveFeed:
         )
 
     async def packets(self) -> AsyncGenerator[bytes | str]:
-        """Yield frames and events as they come, until the consumer closes the generator."""
+        """Yield frames and events as they become available, until the consumer closes the generator."""
         loop, has_news = asyncio.get_running_loop(), asyncio.Event()
         self.session.subscribe(lambda: loop.call_soon_threadsafe(has_news.set))
         try:
