@@ -150,8 +150,8 @@ class Performance:
         return muscles.activations[step - 1] if step > 0 else np.zeros(len(muscles.segments))
 
     def forces(self, index: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return contact points, m, and forces on the body, body weights, both (C, 3), in the step that leads to the
-        nearest frame."""
+        """Return the contact points, in m, and the forces on the body, in body weights, both (C, 3), in the step that
+        leads to the nearest frame."""
         contacts = self.contacts
         assert contacts is not None
         chosen = np.flatnonzero(contacts.step == int(self.steps[round(index)]) - 1)
@@ -164,8 +164,8 @@ class Performance:
 
 
 def read_performance(path: Path) -> Performance:
-    """Read the first body of a bundle, or the run to which ``path`` belongs: its folder or one of its two files of
-    arrays.
+    """Read the first body of a bundle, or a run. ``path`` is the bundle, the folder of the run, or one of the two files
+    of arrays of the run.
 
     Raises:
         ReadError: the files are missing or do not belong to a run or a bundle.

@@ -31,7 +31,7 @@ SELECTION_FLAGS = SelectionNames("--object", "--cameras", "--view", "--mask-mode
 """Flags that select an object, for messages."""
 _MAX_REST = 0.05
 """Maximum share of a capture's total opacity outside the object for the object to count as the whole capture. For an
-object on a white desk or a turntable, the share of the haze after a short training is 0.01 to 0.03."""
+object on a white desk or a turntable, the share of the haze after a short training run is 0.01 to 0.03."""
 
 
 @dataclass(frozen=True)

@@ -81,10 +81,10 @@ def upright_frame(points: np.ndarray, weights: np.ndarray, plane: Plane) -> Body
 
     The origin is the projection of a robust centre onto the plane. The robust centre is the fixed point of a mean with
     wide Gaussian weights about this mean. The x axis is the longer principal axis within the plane. If the body is
-    nearly round about the up direction, it is defined by the strongest of the angular moments sum w r^p e^(i m angle),
-    m = 1 to 6. The moment of order m defines m directions, of which the one closest to the moment of order 1 is used.
-    The exponent p is m, except that it is 3 for m = 1. The unit of length is the median distance from the robust
-    centre. Equal points in equal order give bitwise equal frames.
+    nearly round about the up direction, the x axis is instead defined by the strongest of the angular moments sum w r^p
+    e^(i m angle), m = 1 to 6. The moment of order m defines m directions, of which the one closest to the moment of
+    order 1 is used. The exponent p is m, except that it is 3 for m = 1. The unit of length is the median distance from
+    the robust centre. Equal points in equal order give bitwise equal frames.
 
     Args:
         points: (n, 3) points of the body.
@@ -128,7 +128,8 @@ def _middle(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float,
 
 
 def _angular_moment(flat: np.ndarray, weights: np.ndarray, fold: int) -> complex:
-    """Return sum w r^p e^(i m angle) / sum w r^p of the points ``flat`` (n,), x + iy, with m = ``fold``.
+    """Return the complex angular moment sum w r^p e^(i m angle) / sum w r^p of the points ``flat`` (n,), given as x +
+    iy, with m = ``fold``.
 
     The exponent p is m, except that it is 3 for m = 1, because that moment with p = 1 vanishes about the mean.
     """

@@ -79,11 +79,11 @@ class Gait:
         return self.step_count + len(self.groups) - 1
 
     def swing_feet(self, swing: int) -> tuple[int, ...]:
-        """Return the feet of swing ``swing`` (0, 1, ...)."""
+        """Return the indices of the feet that swing in swing number ``swing``, counted from 0."""
         return self.groups[swing % len(self.groups)]
 
     def target_step(self, swing: int) -> int:
-        """Return the step at whose planar pose the feet of swing ``swing`` land."""
+        """Return the index of the step at whose planar pose the feet of swing number ``swing`` land."""
         return min(swing + 1, self.step_count)
 
     def progress(self, swing: int, elapsed: float) -> float:

@@ -67,7 +67,7 @@ class Key:
     weight: float = 1.0
     """Factor on the weight of the motion, in the interval that ends at this key."""
     where: str = ""
-    """File and position of the key in it, for messages."""
+    """File that contains the key, and position of the key in the file, for messages."""
 
 
 @dataclass(frozen=True)

@@ -198,9 +198,9 @@ class GaussianCounts:
     """Numbers of Gaussians, from the capture to the pictures."""
 
     read: int
-    """Gaussians in the capture."""
+    """Number of Gaussians in the capture."""
     drawn: int
-    """Gaussians in the pictures, after splitting."""
+    """Number of Gaussians in the pictures, after splitting."""
     left_out_of_contact: int
     """Gaussians that are not used for contact."""
     left_out_of_contact_opacity: float

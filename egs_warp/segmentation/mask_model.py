@@ -39,7 +39,7 @@ class ClickModel(Protocol):
 
         Args:
             picture: (H, W, 3) float32, 0 to 1.
-            points: (n, 2) pixels.
+            points: (n, 2) positions of the points, pixels.
             inside: (n,) bool, True for points on the object, False for points beside it.
         """
         ...

@@ -10,7 +10,7 @@ from egs_warp.training.checkpoint import State
 _RATE, _LAST_RATE = 1e-2, 1e-4
 """Learning rate of Adam at the start and at the end."""
 _REGULARIZATION = 1e-2
-"""Weight of the squared distance from the mean colour map. Changes that all photos share are part of the cloud
+"""Weight of the squared distance from the mean colour map. Changes that all photos share belong in the cloud
 instead."""
 
 

@@ -2,7 +2,7 @@
 one creature.
 
 Indices of nodes, tetrahedra, ends of muscles, fibres and feet are shifted, so that every layer of the page draws all
-bodies. The fact ``bodies`` lists the part of each body.
+bodies. The entry ``bodies`` of the facts lists the part of each body.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 
 import type { Frame } from "./packets";
 
-/** Number of past arrivals that are stored. */
+/** Number of past frames that are stored. */
 const MAX_FRAMES = 900;
 /** Length of the window over which the solver's speed is averaged, s. */
 const AVERAGING_TIME = 4;
