@@ -40,7 +40,7 @@ def add_creature(context: bpy.types.Context, path: Path, *, set_up_scene: bool) 
     Args:
         context: The context of Blender.
         path: A bundle or a run, as for ``read_performance``.
-        set_up_scene: Set frame rate, frame range and the render settings that the splats need.
+        set_up_scene: True to set the frame rate, the frame range and the render settings that the splats need.
 
     Raises:
         ReadError: the files cannot be read.

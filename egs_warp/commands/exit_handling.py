@@ -209,7 +209,7 @@ class _Stream:
             self._silence()
 
     def _silence(self) -> None:
-        # Redirect to the null device, so that buffered output is dropped now and when Python exits.
+        # Redirect the stream to the null device, so that buffered output is dropped now and when Python exits.
         with contextlib.suppress(OSError, ValueError):
             null = os.open(os.devnull, os.O_WRONLY)
             os.dup2(null, self._stream.fileno())

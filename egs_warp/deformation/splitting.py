@@ -192,7 +192,7 @@ def split_for_motion(
 
     Args:
         frames: node positions of each frame, as for ``deform``.
-        max_growth: largest ratio of the number of Gaussians after the split to that before it.
+        max_growth: maximum ratio of the number of Gaussians after the splits to the number before.
     """
     result = SplitGaussians(
         cloud, embedding, np.arange(cloud.count, dtype=np.int32), np.zeros(cloud.count, dtype=np.int8)

@@ -251,7 +251,7 @@ def _training_time(new_count: float, steps: int) -> float:
 
 
 def _window_around(background: GaussianCloud, hole: Hole, margin: float) -> tuple[PlaneWindow, np.ndarray, int]:
-    """Return a window about the hole, the enlarged hole on it, and the spacing of new Gaussians in texels.
+    """Return a window around the hole, the enlarged hole on this window, and the spacing of new Gaussians in texels.
 
     The spacing is chosen so that the new floor is as sharp as the old one.
     """

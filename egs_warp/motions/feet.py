@@ -211,7 +211,7 @@ def no_slip_feet(
 
     Args:
         body: the body.
-        feet: its feet.
+        feet: feet of the body.
         contacts: contacts of the previous time step.
         loads: (n,) load of each contact by which the mean is weighted, as a fraction of the body weight; 0 excludes a
             contact.

@@ -152,7 +152,8 @@ class Jump(JoinedMotion[JumpWorlds]):
 
     @property
     def heading(self) -> float:
-        """Change of the heading from the start until now in radians, without wrapping; 0 for a jump that keeps it."""
+        """Change of the heading from the start until now in radians, without wrapping; 0 for a jump that keeps its
+        heading."""
         return float(self._worlds.heading.now[self._row])
 
     @property

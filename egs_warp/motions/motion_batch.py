@@ -64,7 +64,7 @@ class _Group:
     """(k, N, 3) m, reference arms."""
 
     def objectives(self, state: BatchState, contacts: _Contacts, up: torch.Tensor, dt: float) -> BatchObjectives:
-        """Return the objectives of the worlds of the group for the step of ``dt`` seconds from ``state``."""
+        """Return the objectives of the worlds of the group for the time step of ``dt`` s that starts at ``state``."""
         positions, velocities = state.positions, state.velocities
         moments = part_moments(self.shares, self.reference, positions, velocities)
         reduced = ReducedState(

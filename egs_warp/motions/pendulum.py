@@ -1,8 +1,8 @@
 """Linear inverted pendulum model of a walking body: c'' = w^2 (c - p), with centre of mass c and centre of pressure p.
 
 The divergent component of motion is x = c + c' / w, with x' = w (x - p). It is the instantaneous capture point of Pratt
-et al. (2006). Its plans follow Englsberger et al. (2015), "Three-dimensional bipedal walking control based on divergent
-component of motion".
+et al. (2006). Plans of this component follow Englsberger et al. (2015), "Three-dimensional bipedal walking control
+based on divergent component of motion".
 """
 
 from __future__ import annotations

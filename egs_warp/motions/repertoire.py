@@ -200,7 +200,7 @@ def _path_length(points: np.ndarray) -> float:
 
 
 def _frames_of_walk(path_length: float, request: MotionRequest) -> int:
-    """Return the number of frames at 60 Hz within which a path of ``path_length`` body heights is walked."""
+    """Return the number of frames at 60 Hz within which a path of ``path_length`` body heights must be walked."""
     return 170 + int(np.ceil(36 * path_length / _MIN_STEP / request.asked["speed"]))
 
 

@@ -222,7 +222,7 @@ class MotionSequence:
         self._is_dropped = self._gets_up_next = True
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the current motion for the time step of ``dt`` seconds from ``state``; start the
+        """Return the objectives of the current motion for the time step of ``dt`` s that starts at ``state``; start the
         next motion if the current one has ended."""
         if self._parts and (not self.done or self._resting):
             self.start_next(state, report)

@@ -13,8 +13,8 @@ from egs_warp.geometry.height_field import HeightField
 _GROUND_DISTANCE = 0.05
 """Maximum distance from the ground, in body heights, of nodes that stand on it and of Gaussians that belong to it."""
 _COVER_DISTANCE = 0.03
-"""Horizontal distance from a ground Gaussian, in body heights, within which a node is over ground, or twice the width
-of the Gaussian if that is larger."""
+"""Horizontal distance from a ground Gaussian, in body heights, within which a node is over ground; if it is larger,
+twice the width of the Gaussian applies."""
 _MIN_SHARE = 0.5
 """Minimum fraction of the standing nodes that must be over ground."""
 _MIN_OPACITY = 0.3

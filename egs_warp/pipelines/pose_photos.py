@@ -177,8 +177,8 @@ def _write_model(model: Any, folder: Path, out: Path | str) -> None:
 def _work_folder(folder: Path, resume: bool | None) -> Iterator[Path]:
     """Remove temporary folders of killed runs, and create one in the locked ``folder``.
 
-    With ``resume`` True, the database of an interrupted run is reused. With True or False, the temporary folder remains
-    if a signal or a crash ends the run.
+    If ``resume`` is True, the database of an interrupted run is reused. If it is True or False, the temporary folder
+    remains if a signal or a crash ends the run.
     """
     kept = folder / f"{_WORK_PREFIX}kept"
     for remnant in folder.glob(f"{_WORK_PREFIX}*"):

@@ -202,7 +202,7 @@ class GaussianCounts:
     drawn: int
     """Number of Gaussians in the pictures, after splitting."""
     left_out_of_contact: int
-    """Gaussians that are not used for contact."""
+    """Number of Gaussians that are not used for contact."""
     left_out_of_contact_opacity: float
     """Fraction of the opacity of the Gaussians that are not used for contact."""
 

@@ -41,7 +41,7 @@ class ExtentMeasure(enum.Enum):
     """Measure of a Gaussian's extent towards the plane."""
 
     AXIS_TIPS = "axis-tips"
-    """The distance of the farthest of the six axis tips of the ellipsoid, Eq. (20)."""
+    """Distance to the farthest of the six axis tips of the ellipsoid, Eq. (20)."""
     ELLIPSOID = "ellipsoid"
     """The extent of the ellipsoid along the normal, gamma sqrt(N^T Sigma N), which is up to sqrt 3 times the extent of
     the tips."""
@@ -371,7 +371,7 @@ def straddling_loss(tensors: GaussianTensors, near: Any, normal: Any, offset: fl
     """Return L_seg (Eq. 21), the sum of eta_seg - |d0| over the Gaussians with indices ``near`` (m,) that straddle the
     plane.
 
-    The result is a scalar tensor, scene units; ``normal`` (3,) and ``offset`` are the plane's.
+    The result is a scalar tensor, scene units; ``normal`` (3,) and ``offset`` are those of the plane.
     """
     import torch
 

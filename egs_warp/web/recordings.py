@@ -25,7 +25,7 @@ from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, report_of_run
 
 MAX_TAKE_SECONDS = 120.0
-"""Maximum length of a take in simulated time, s; a longer take is ended."""
+"""Maximum length of a take in simulated time, s; a take that reaches it is ended."""
 SCRIPT = "script.json"
 """File with the motions of a take."""
 
