@@ -125,7 +125,7 @@ class GraphStream:
 
         Args:
             work: operations to capture.
-            keep: retain the raw graph, so that it can become part of another graph.
+            keep: True to retain the raw graph, so that it can become part of another graph.
         """
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()

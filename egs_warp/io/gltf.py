@@ -30,7 +30,7 @@ EXTENSION = "KHR_gaussian_splatting"
 _SPZ = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
 """Extensions for splats compressed as .spz: the name in the draft, and the name in earlier files."""
 _SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
-"""Extension of a draft of 2025 that is used instead of ``EXTENSION``."""
+"""Extension of a draft of 2025, which files of that time contain instead of ``EXTENSION``."""
 _QUANTIZED = "KHR_mesh_quantization"
 _READ = (EXTENSION, *_SPZ, _SPZ_ALONE, INSTANCING, _QUANTIZED)
 _SURFACES = ("KHR_materials_", "EXT_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")

@@ -195,10 +195,10 @@ def animate(
         plane: Ground plane in the capture's frame (``make_creature``).
         background: Gaussians behind the object, in the capture's frame and units; None draws a plain floor.
         options: Targets, video and creature; None uses the default.
-        overwrite: Move an earlier run in ``out`` aside.
-        resume: Continue the interrupted run in ``out``; with equal arguments, the result is bitwise equal to that of an
-            uninterrupted run.
-        quiet: Show no progress bars.
+        overwrite: True to move an earlier run in ``out`` aside.
+        resume: True to continue the interrupted run in ``out``; with equal arguments, the result is bitwise equal to
+            that of an uninterrupted run.
+        quiet: True to show no progress bars.
         show_note: Called once with each note for the user that is not in ``options.notes``, as soon as it is known.
 
     Returns:

@@ -49,7 +49,7 @@ def write_world(
         size: Width and height of the film, pixels, if ``shot`` has no size.
         view_from: (3,) Direction to the camera in the axes of the world; None chooses it (``world_camera``).
         shadow: True to draw the shadows of the bodies.
-        overwrite: Move the files of an earlier run in ``out`` aside.
+        overwrite: True to move the files of an earlier run in ``out`` aside.
         quiet: True to show no progress bar.
         notes: Notes for the report.
         asked: Contents of the world file, for the report.

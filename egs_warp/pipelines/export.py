@@ -78,7 +78,7 @@ def export_splats(
         frame: Export only this frame; negative numbers count from the end.
         every: Interval of the exported frames, in frames at 60 Hz.
         degree: SH degree of the colours; None keeps the degree of the capture.
-        quiet: Show no progress bar.
+        quiet: True to show no progress bar.
 
     Raises:
         UserError: The run does not have ``frame``; ``out`` contains other frames, or is the name of a file although

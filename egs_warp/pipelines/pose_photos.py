@@ -100,9 +100,9 @@ def pose_photos(
         frames: Number of frames to choose from a video.
         max_side: Maximum length of the longer side of the images in which features are detected, pixels.
         seed: Seed of COLMAP.
-        overwrite: Move an earlier run in ``out`` aside.
-        resume: True reuses the features and matches of an interrupted run with the same arguments. If this run is
-            interrupted, True and False save its features and matches, None deletes them.
+        overwrite: True to move an earlier run in ``out`` aside.
+        resume: True to reuse the features and matches of an interrupted run with the same arguments. If this run is
+            interrupted, its features and matches are kept if ``resume`` is True or False, and deleted if it is None.
         stage: Called with a description of each stage as it starts.
         progress: Called with the name of a stage, the number of its finished items, and their total number.
 

@@ -58,7 +58,7 @@ def render_run(
             the motion.
         shadow: Draw a shadow on the ground.
         light: True to use the main light of the run, if it has one.
-        quiet: Show no progress bar.
+        quiet: True to show no progress bar.
 
     Returns:
         The number of frames.

@@ -137,8 +137,8 @@ def train(
         device: Warp device; None uses the current one.
         threads: Number of threads; None uses the default.
         checkpoint: File (.npz) to which the state is written every half minute; it is not removed.
-        resume: Continue from ``checkpoint``; on a CPU, the result is bitwise equal to that of an uninterrupted run with
-            equal arguments.
+        resume: True to continue from ``checkpoint``; on a CPU, the result is bitwise equal to that of an uninterrupted
+            run with equal arguments.
         progress: Called after each step with its number and loss.
         stage: Called with a description of each stage as it starts.
 

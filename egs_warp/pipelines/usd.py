@@ -52,7 +52,7 @@ def export_usd(
         path: Name that ends in .usdc or .usda.
         every: Interval of the exported frames, in frames at 60 Hz.
         degree: SH degree of the colours, which take most of the file; None keeps the degree of the capture.
-        quiet: Show no progress bar.
+        quiet: True to show no progress bar.
 
     Raises:
         UserError: usd-core is not installed or too old, or ``path`` has another ending.

@@ -205,7 +205,7 @@ def draw_world_film(
         name: Name of the video, without the file ending.
         shot: Camera motion, size, frame rate and background colour.
         shadow: Draw the shadows of the bodies on the ground, on obstacles and on each other.
-        quiet: Show no progress bar.
+        quiet: True to show no progress bar.
 
     Returns:
         The name of the video.

@@ -40,7 +40,7 @@ class LinkFeatures:
     concavity: np.ndarray
     """(m,) 0 to 2, component along the link of the difference of the outward normals, where the surface is concave."""
     convexity: np.ndarray
-    """(m,) 0 to 2, the same where the surface is convex."""
+    """(m,) 0 to 2, the same component where the surface is convex."""
     turn: np.ndarray
     """(m,) 0 to 2, one minus the cosine of the angle between the normals of the ends."""
     gap: np.ndarray

@@ -143,8 +143,8 @@ def finetune(
         extra_loss: function that computes an additional loss from the parameters, for example ``L_seg`` of Eq. (21).
         trainable: (n,) bool, Gaussians that may change; it cannot be combined with relocation.
         checkpoint: .npz file for the state, which is written about every half minute.
-        resume: continue from ``checkpoint``; on a CPU, the result is bitwise equal to the result of an uninterrupted
-            run.
+        resume: True to continue from ``checkpoint``; on a CPU, the result is bitwise equal to the result of an
+            uninterrupted run.
         progress: called with the index and loss of each step.
 
     Returns:

@@ -68,7 +68,7 @@ class LiveFeed:
             "friction": creature.geometry.friction,
             "front": creature.front.direction[:2].tolist(),
             "flat": len(creature.geometry.planes) == 1 and creature.geometry.field is None,
-            # The momentum residual can only be computed after a step, so only takes contain its curve.
+            # The momentum residual can only be computed after a step, so only recorded takes contain its curve.
             "curves": curve_facts([curve for curve in CURVES if curve[0] != "residual"]),
             "audit": {},
             "motion": [],
