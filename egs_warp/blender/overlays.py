@@ -87,7 +87,7 @@ def add_centre_of_mass(performance: Performance, name: str) -> bpy.types.Object:
 
 
 def move_centre_of_mass(centre: bpy.types.Object, performance: Performance, index: float) -> None:
-    """Move the centre of mass to frame ``index``."""
+    """Move the marker to the centre of mass in frame ``index``."""
     centre.location = performance.centre_of_mass(index)
 
 

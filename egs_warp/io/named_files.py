@@ -42,8 +42,8 @@ def named_files(*paths: Path, overwrite: bool = False) -> Iterator[NamedFiles]:
         # Check again: files may have been created between the first check and the lock.
         check_named_files(*paths, overwrite=overwrite)
         yield NamedFiles(paths)
-        # Remove leftovers of a killed run that were too young before, so that they could have been files of a running
-        # one.
+        # Remove leftovers of a killed run that were kept before, because they were so recent that they could have
+        # belonged to an active run.
         for folder in folders:
             sweep_all(folder)
 

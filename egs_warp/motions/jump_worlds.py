@@ -39,8 +39,8 @@ must equal the capture point; from the second on, the foothold may differ from i
 STEP_CLEARANCE = 0.15
 """Clearance of the feet above a step in the ground, as a fraction of its height, before they swing forward."""
 APPROACH_RATE = 2.5
-"""Product of the rate at which the landing pose is approached and the remaining time in the air. Because of this
-product, the approach is slow at first."""
+"""Product of the rate at which the landing pose is approached and the remaining time in the air. Since the product is
+constant, the approach is slow at first."""
 TOUCH_DOWN_HEIGHT = 0.06
 """Height of the centre of mass above its standing height, in body heights, below which the first contact is considered
 the landing."""

@@ -15,7 +15,8 @@ class Retake:
     factors: Mapping[str, float] = field(default_factory=dict)
     """Factors on the requested values, by name; factors on values that are missing are ignored."""
     replacements: Mapping[str, float] = field(default_factory=dict)
-    """Replacements of requested values, by name, or fixed values of a motion without such a parameter."""
+    """Values that replace the requested ones, by name; a motion without a parameter of this name is performed with the
+    value, too."""
     style: Mapping[str, float] = field(default_factory=dict)
     """Factors on the style of jumps (``egs_warp.motions.style``)."""
 

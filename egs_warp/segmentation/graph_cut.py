@@ -45,7 +45,7 @@ class SplatGraph:
 
     @classmethod
     def of(cls, cloud: GaussianCloud, chosen: np.ndarray, *, neighbours: int = _NEIGHBOURS) -> SplatGraph:
-        """Link each of the Gaussians with the indices ``chosen`` (n,) of ``cloud`` to its nearest ``neighbours``.
+        """Link each of the Gaussians with the indices ``chosen`` (n,) of ``cloud`` to its ``neighbours`` nearest ones.
 
         Training stacks Gaussians at one place; their nearest neighbours would be in the same stack. Therefore only one
         Gaussian of each place (``distinct_places``) is linked to its neighbours, and the others are linked to it.
@@ -67,7 +67,7 @@ class SplatGraph:
 
     @classmethod
     def linking(cls, points: np.ndarray, colours: np.ndarray, *, neighbours: int = _NEIGHBOURS) -> SplatGraph:
-        """Link each of the ``points`` (n, 3) with ``colours`` (n, 3), 0 to 1, to its nearest ``neighbours``."""
+        """Link each of the ``points`` (n, 3) with ``colours`` (n, 3), 0 to 1, to its ``neighbours`` nearest points."""
         count = len(points)
         if count < 2:
             nothing = np.zeros(0, np.int32)

@@ -27,7 +27,7 @@ _FRINGE, _FOOT, _HAZE = 0.1, 0.05, 0.1
 """Maximum distance from the object, maximum height above its plane, and maximum width of the remnants at the object's
 foot, as fractions of the object's size."""
 _POINTS = 4000
-"""Maximum number of points used, evenly sampled."""
+"""Maximum number of points that are used; larger sets are sampled evenly."""
 _ROUNDS, _GRID_SIZE = 4, 15
 """Number of successively narrower searches, and number of directions that are tried along each axis."""
 

@@ -151,8 +151,8 @@ def finetune(
         The new cloud, on the same device, and the losses.
 
     Raises:
-        UserError: a view does not fit its camera, the loss is not finite, or the checkpoint belongs to another
-            training.
+        UserError: a view does not fit its camera, the loss is not finite, or the checkpoint belongs to another training
+            run.
     """
     options = options or FinetuneOptions()
     antialiased = cloud.antialiased if options.antialiased is None else options.antialiased
