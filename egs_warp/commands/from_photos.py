@@ -192,8 +192,8 @@ class _Run:
     def _stage(
         self, stage: str, options: Mapping[str, Any], inputs: Sequence[Path], files: Callable[[], Sequence[Path]]
     ) -> Iterator[StageState | None]:
-        """Context of one stage: yield the state of ``stage``, or None if it has already finished. Its start is
-        recorded, and at its end the ``files`` that it has written."""
+        """Context of one stage: yield the state of ``stage``, or None if it has already finished. The start of the
+        stage is recorded, and at its end, the ``files`` that it has written."""
         from egs_warp.io.stage_record import StageState, stage_key
 
         self._bar.update(_BARS[stage][0])

@@ -1,7 +1,7 @@
 """Selection of the offset from which each pixel of a hole is copied: a few good offsets, assigned by graph cuts.
 
-He and Sun 2012 (statistics of offsets), Kwatra et al. 2003 (cost of a seam), Boykov, Veksler, Zabih 2001 (expansion
-moves).
+Sources: He and Sun 2012 (statistics of offsets), Kwatra et al. 2003 (cost of a seam), Boykov, Veksler, Zabih 2001
+(expansion moves).
 """
 
 from __future__ import annotations

@@ -49,8 +49,8 @@ class Kick:
             target: distance and height of the jump, m.
 
         Raises:
-            TargetError: if the other body is out of reach of the jump, or the ground ends where
-                the body would land.
+            TargetError: if the other body is out of reach of the jump, or the ground ends where the body
+                would land.
         """
         self.body, self._other, self._name = stance.body, other, name
         ground = stance.ground

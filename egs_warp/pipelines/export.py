@@ -75,7 +75,7 @@ def export_splats(
         run: The run to export.
         out: Folder for the files; for a single ``frame`` also the name of a file with the ending of its kind.
         kind: A key of ``WRITERS``.
-        frame: Export only this frame; negative numbers count from the end.
+        frame: Number of the only frame to export; negative numbers count from the end. None exports all frames.
         every: Interval of the exported frames, in frames at 60 Hz.
         degree: SH degree of the colours; None keeps the degree of the capture.
         quiet: True to show no progress bar.

@@ -117,7 +117,8 @@ def draw_film(
         shadow: True to draw a shadow on the ground.
         light: Main light in the axes of the capture, which relights the creature and casts its shadow; None keeps the
             captured colours and draws the shadow straight below the creature.
-        max_gaussians: Draw only the most visible Gaussians of the creature, at most this many; None draws all.
+        max_gaussians: Maximum number of Gaussians of the creature, of which only the most visible are drawn; None draws
+            all.
         quiet: True to show no progress bar.
     """
     creature, simulation = performance.creature, performance.simulation

@@ -56,7 +56,7 @@ def render_run(
         show: Quantity to show.
         hold: Frame, counted at 60 Hz, at which the motion is frozen while the camera moves around it once; None shows
             the motion.
-        shadow: Draw a shadow on the ground.
+        shadow: True to draw a shadow on the ground.
         light: True to use the main light of the run, if it has one.
         quiet: True to show no progress bar.
 

@@ -1,8 +1,8 @@
 """Obstacles of a world from a captured scene: the ground with its edge, and convex solids beside and above it.
 
-The remaining scene is a lattice of occupied cells in the frame of the world. Occupied cells near the plane of the
-lowest object are ground. Where there are no such cells, the ground falls to the surface below, or to a floor. Occupied
-cells above the ground are covered with boxes.
+The remaining scene is represented by the occupied cells of a lattice in the frame of the world. Occupied cells near the
+plane of the lowest object are ground. Where there are no such cells, the ground falls to the surface below, or to a
+floor. Occupied cells above the ground are covered with boxes.
 """
 
 from __future__ import annotations

@@ -56,8 +56,8 @@ class PhotoScore:
     plain_ssim: float
     """Mean structural similarity of the render without the affine map."""
     is_outlier: bool = False
-    """True if the photo does not fit the others, because its pose is wrong or something moved. Means exclude such
-    photos."""
+    """True if the photo does not fit the others, because its pose is wrong or something moved. The mean scores exclude
+    such photos."""
 
 
 @dataclass(frozen=True)

@@ -133,9 +133,9 @@ class World:
             name: Name for messages and files; None numbers the bodies: ``creature-1``, ``prop-2``.
             path: Path that a prop, such as a lift, follows from its place, whatever pushes it. The prop passes through
                 the ground and the solids of the world, but it carries and pushes other bodies.
-            as_captured: Place the body where it is in the scene of the surroundings, to whose capture it belongs;
-                ``at``, ``above`` and ``heading`` do not apply. It is raised slightly if it is inside the ground or a
-                body below it.
+            as_captured: True to place the body where it is in the scene of the surroundings, to whose capture it
+                belongs; ``at``, ``above`` and ``heading`` do not apply. It is raised slightly if it is inside the
+                ground or a body below it.
 
         Returns:
             The placed body, its key in the arguments of ``simulate`` and in the result.

@@ -204,7 +204,7 @@ def draw_world_film(
         folder: Folder for the files.
         name: Name of the video, without the file ending.
         shot: Camera motion, size, frame rate and background colour.
-        shadow: Draw the shadows of the bodies on the ground, on obstacles and on each other.
+        shadow: True to draw the shadows of the bodies on the ground, on obstacles and on each other.
         quiet: True to show no progress bar.
 
     Returns:
@@ -234,7 +234,7 @@ def world_frames(
         frames: Frames to render.
         cameras: Camera of each frame.
         shot: Background colour and transparency.
-        shadow: Draw the shadows of the bodies on the ground, on obstacles and on each other.
+        shadow: True to draw the shadows of the bodies on the ground, on obstacles and on each other.
     """
     device = filmed_device(filmed)
     obstacles = _obstacles(filmed.solids, filmed.motion().positions.reshape(-1, 3), device)

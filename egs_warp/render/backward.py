@@ -69,9 +69,9 @@ def backward(
         alpha_gradient, depth_gradient: (H, W) float32, gradients with respect to ``image``'s alpha and depth; None for
             zero.
         antialiased: as in the forward pass.
-        want_pose: also compute the gradient with respect to the camera pose.
-        want_screen: also compute the gradient with respect to the screen positions.
-        threads: CPU threads.
+        want_pose: True to also compute the gradient with respect to the camera pose.
+        want_screen: True to also compute the gradient with respect to the screen positions.
+        threads: number of CPU threads.
         onto: cloud whose arrays receive the gradients with respect to the attributes; default: new arrays.
     """
     device, count = cloud.device, cloud.count

@@ -1,8 +1,8 @@
 """Interactive segmentation: the Gaussians of an object from clicks, in about one second for a few hundred thousand
 Gaussians.
 
-A capture is prepared once: clusters of neighbouring Gaussians, and the links between clusters. For each change of the
-clicks, a problem with some ten thousand clusters is solved. See docs/concepts/segmentation.md.
+A capture is prepared once: neighbouring Gaussians are grouped into clusters, and neighbouring clusters are linked. For
+each change of the clicks, a problem with some ten thousand clusters is solved. See docs/concepts/segmentation.md.
 """
 
 from __future__ import annotations

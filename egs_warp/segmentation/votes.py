@@ -57,9 +57,9 @@ def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
     """Sum the blending weight of each Gaussian over the pixels inside and outside the masks.
 
     A Gaussian's blending weight in a pixel is the derivative of the pixel's colour with respect to the Gaussian's
-    colour. Therefore, the votes are the colour gradient of a weighted picture, in which masked pixels have the weight
-    in red and all others have it in green; the renderer's backward kernels compute this gradient. Raises ``UserError``
-    for masks whose size differs from their cameras'.
+    colour. Therefore, the votes are the colour gradient of a weighted picture, in which the red channel has the weight
+    1 inside the mask and the green channel has it outside; the renderer's backward kernels compute this gradient.
+    Raises ``UserError`` for masks whose size differs from their cameras'.
     """
     sums = np.zeros((cloud.count, 3))
     # Use the same grey for all Gaussians, because colours are not clipped and SH bands above 0 are not needed.

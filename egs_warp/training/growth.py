@@ -49,8 +49,8 @@ class Growth:
             self.cap = min(self.cap, count)
 
     def restart(self) -> None:
-        """Clear the recorded losses, because they are not comparable with those at the next resolution. Lift a cap that
-        was set because of them, because larger images may need more Gaussians."""
+        """Clear the recorded losses, because they are not comparable with those at the next resolution. Also lift a cap
+        that was derived from these losses, because larger images may need more Gaussians."""
         self._losses.clear()
         self.history.clear()
         self.cap, self._idle = self._limit, 0
