@@ -1,8 +1,9 @@
 """Newton step of the Coulomb solve by a block of threads on a GPU, for up to 120 unknowns (see ``coulomb_block``).
 
 The equations are written as tiles of 8 x 8, which the threads hold in registers, and eliminated eight unknowns at a
-time on the tensor cores. ``_TILES`` lays out the shared memory, ``LIST`` finds the unknowns and writes their lines,
-``_WRITE`` expands the lines to tiles, ``_ELIMINATE`` solves.
+time on the tensor cores. The C++ source has four parts: ``_TILES`` lays out the shared memory, ``LIST`` finds the
+unknowns and writes a compact form of their rows (*lines*), ``_WRITE`` expands the lines to tiles, and ``_ELIMINATE``
+solves the equations.
 """
 
 import warp as wp
@@ -325,10 +326,23 @@ def step_by_block(
     step: wp.array[real],
     change: wp.array[real],
 ) -> int:
-    """Compute the Newton ``step`` of ``write_equations`` and ``solve_equations``, without row exchanges.
+    """Compute the Newton step of ``write_equations`` and ``solve_equations``, without row exchanges.
 
-    ``shared_address`` is the result of ``shared_memory``, ``values`` (3n,) the residual of the projection equations,
-    and ``change`` (3n,) scratch memory. Return 1 on success. Return 0, with an invalid step, if a pivot is not larger
-    than ``min_pivot`` or there are more than 120 unknowns.
+    Args:
+        shared_address: result of ``shared_memory``.
+        delassus: (3n, 3n) m/(N s), Delassus operator.
+        friction: Coulomb coefficient.
+        count: number n of contacts.
+        forces: (3n,) newtons, forces at the start of the step.
+        velocities: (3n,) m/s, contact velocities under these forces, including the normal bias.
+        values: (3n,) newtons, residual of the projection equations.
+        scale: scale of the projection rates (``rate_of``).
+        regularization: added to the diagonal of normal and sticking components.
+        min_pivot: pivots must be larger than this.
+        step: (3n,) newtons, output.
+        change: (3n,) scratch memory.
+
+    Returns:
+        1 on success; 0, with an invalid step, if a pivot is too small or there are more than 120 unknowns.
     """
     ...

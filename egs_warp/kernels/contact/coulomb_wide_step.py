@@ -1,6 +1,6 @@
 """Newton step of the Coulomb solve by a block of threads on a GPU, for 121 to 256 unknowns.
 
-The method is the same as in ``coulomb_step``, in passes of 64 columns.
+The method is that of ``coulomb_step``, in passes of 64 columns.
 """
 
 import warp as wp
@@ -228,7 +228,11 @@ def wide_step_by_block(
     change: wp.array[real],
     matrix: wp.array2d[Vec4],
 ) -> int:
-    """Compute the Newton step like ``step_by_block``, for 121 to 256 unknowns; return 0 for other numbers of unknowns
-    too. ``matrix`` is scratch memory.
+    """Compute the Newton step like ``step_by_block``, but for 121 to 256 unknowns.
+
+    The arguments are those of ``step_by_block``, and ``matrix``, which is scratch memory with space for all equations.
+
+    Returns:
+        1 on success; 0, with an invalid step, if a pivot is too small or the number of unknowns is outside this range.
     """
     ...
