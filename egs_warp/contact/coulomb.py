@@ -66,7 +66,7 @@ def _continue_from_compliance(
     forces: ArrayT,
     counts: torch.Tensor | None = None,
 ) -> tuple[ArrayT, _Residual]:
-    """Solve with less and less compliant contacts, starting from ``forces``.
+    """Solve with gradually decreasing compliance of the contacts, starting from ``forces``.
 
     ``solve`` maps an operator and initial forces to forces and their residual. Return the forces and the residual for
     ``delassus`` itself, without compliance.
@@ -113,8 +113,8 @@ def coulomb_forces(
 
 
 class _CoulombWorkspace:
-    """Buffers for a problem of ``count`` contacts, and a recorded launch on them: preparing a new launch takes as long
-    as solving for ten contacts.
+    """Buffers for a problem of ``count`` contacts, and a launch that is recorded on them, because preparing a new
+    launch takes as long as solving for ten contacts.
     """
 
     def __init__(self, count: int) -> None:

@@ -67,7 +67,8 @@ class DeformedShape:
 
 def protrusion(mesh: TetMesh, weights: np.ndarray) -> float:
     """Return an upper bound, in metres, of the distance between the contact points of a prop and its tetrahedron, for
-    the barycentric ``weights`` (P, 4) of the points. It is 0 for a cage of several tetrahedra, which encloses the body.
+    the barycentric ``weights`` (P, 4) of the points. The bound is 0 for a cage of several tetrahedra, which encloses
+    the body.
     """
     if len(mesh.tets) > 1:
         return 0.0

@@ -59,7 +59,9 @@ _SQUARE_FRACTION = 0.5
 
 @dataclass(frozen=True)
 class ContactGeometry:
-    """All points of the body that can be the first of their tetrahedron to touch an obstacle, and the obstacles."""
+    """Contact points, which are all points of the body that can be the first of their tetrahedron to touch an obstacle,
+    and the obstacles.
+    """
 
     mesh: TetMesh
     planes: tuple[Plane, ...]
@@ -70,7 +72,8 @@ class ContactGeometry:
     weights: np.ndarray
     """(P, 4) float64, barycentric weights in the tetrahedron (Eq. 2)."""
     excluded_count: int
-    """Number of Gaussians whose mean lies below the ground or another plane, or inside a solid, at rest."""
+    """Number of excluded Gaussians: those whose mean lies below the ground or another plane, or inside a solid, at
+    rest."""
     excluded_opacity: float
     """Fraction of the total opacity that belongs to the excluded Gaussians."""
     solid_from_plane: tuple[int, ...] = ()
@@ -128,7 +131,7 @@ def contact_geometry(
     arms = gamma * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :] * axes
     obstacles = [Solid((plane,)) for plane in planes] + list(solids)
     grounds = planes if field is None else (field, *planes[1:])
-    # Many points of a flat base lie in the plane up to rounding; they are not treated as below it.
+    # Many points of a flat base lie in the plane up to rounding and are not treated as below it.
     slack = 0.0 if grid is None else _SLACK_FRACTION * grid
     above = np.all([ground.heights(means) >= -slack for ground in grounds], axis=0)
     least = MIN_OUTSIDE_FRACTION * np.count_nonzero(above)
@@ -203,8 +206,8 @@ def _lowest_points(tet_from_point: np.ndarray, points: np.ndarray, field: Height
 
 
 def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int) -> np.ndarray:
-    """Return (k,), the indices of the hull vertices of each tetrahedron's points; ``places`` (P, 3) are in any affine
-    coordinates.
+    """Return (k,), the indices of the hull vertices of each tetrahedron's points. The points are given as ``places``
+    (P, 3) in any affine coordinates.
     """
     order = np.argsort(tet_from_point, kind="stable")
     bounds = np.searchsorted(tet_from_point[order], np.arange(tet_count + 1))
@@ -214,7 +217,7 @@ def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int)
         if len(members) > 8:
             try:
                 members = members[ConvexHull(_bulge(places[members])).vertices]
-            except QhullError:  # all in one plane: keep every point
+            except QhullError:  # All points lie in one plane, so all are retained.
                 pass
         vertices.append(members)
     return np.sort(np.concatenate(vertices))

@@ -151,7 +151,7 @@ class DeviceContactLinearization(ContactLinearization):
     def parse_iterate(
         self, tension: MuscleEnergy | None, forces: np.ndarray, readback: TrialReadback[np.ndarray]
     ) -> DeviceNewtonIterate:
-        """Create an iterate from the read-back of a trial."""
+        """Create an iterate from the read-back of its trial."""
         return self.iterate(
             tension,
             forces,
@@ -395,8 +395,8 @@ class DeviceNewtonIterate:
         workspace.trial_iterate = self
 
     def _slot(self) -> float:
-        """Return the slot of the iterate, ``FROM_BASE`` or ``FROM_TRIAL``. An iterate that is in neither is uploaded
-        first.
+        """Return the slot of the iterate, ``FROM_BASE`` or ``FROM_TRIAL``. An iterate that is in neither slot is
+        uploaded first.
         """
         workspace = self.linearization.workspace
         if self is workspace.base_iterate:

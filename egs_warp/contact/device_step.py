@@ -31,7 +31,7 @@ from egs_warp.precision import Mat33, Vec3
 _CAPACITY_STEP = 64
 """Capacities for rank-one terms of the muscles' stiffness are multiples of this."""
 _SIGNS = (1.0, -1.0)
-"""Signs of the low-rank updates. The update with the negative sign is applied last."""
+"""Signs of the low-rank updates; the update with the negative sign is applied last."""
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ class StepWorkspace:
         segments, directions, rates = tension.hessian(problem.end_positions(velocities)).rank_one_terms(
             min_relative_stiffness=MIN_RELATIVE_STIFFNESS
         )
-        # Terms of positive stiffness are added, terms of negative stiffness subtracted. Padding rows are zero and
+        # Terms of positive stiffness are added, those of negative stiffness subtracted. Padding rows are zero and
         # change nothing.
         terms_by_sign = {sign: np.flatnonzero(sign * rates > 0.0) for sign in _SIGNS}
         packed = [np.zeros((round_up(len(terms), _CAPACITY_STEP), 4)) for terms in terms_by_sign.values()]

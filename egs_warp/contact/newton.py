@@ -210,10 +210,11 @@ class NewtonIterate(Protocol):
     def newton_steps(
         self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
     ) -> NewtonStepResult:
-        """Take Newton steps. The contact forces of each satisfy Coulomb's law for its contact-free velocities.
+        """Take Newton steps. The contact forces of each step satisfy Coulomb's law for the contact-free velocities at
+        its start.
 
-        On the host, or without ``progress``, one step is taken. A GPU takes steps until one needs a decision of the
-        host; all but the last are accepted.
+        On the host, or without ``progress``, one step is taken. A GPU takes steps until one of them needs a decision of
+        the host; all but the last are accepted.
 
         Args:
             shift: (n,) m/s, bias of the normal velocities.
@@ -229,7 +230,7 @@ class NewtonIterate(Protocol):
 
 @dataclass(frozen=True)
 class NewtonStepResult:
-    """Result of one or more Newton steps. The caller decides on the last one."""
+    """Result of one or more Newton steps. The caller decides whether to accept the last one."""
 
     base: NewtonIterate
     """Iterate at the start of the last step."""
@@ -291,7 +292,9 @@ class NativeNewtonIterate(HostNewtonStep):
 
     @cached_property
     def _after(self) -> IterateBuffer:
-        """``state``, after the contact-free velocities of the Newton step have been computed in it."""
+        """The iterate's ``state``, in which the velocities after a Newton step without contact forces have been
+        computed.
+        """
         _workspace_of(self.linearization).newton(self.linearization.tangent, self.state)
         return self.state
 

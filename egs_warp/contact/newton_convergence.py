@@ -57,7 +57,7 @@ class NewtonProgress:
 
     @property
     def previous_residual(self) -> float:
-        """Residual before the last trial."""
+        """Residual before the last trial, divided by dt x weight."""
         return float(self.row[kernels.PREVIOUS_RESIDUAL])
 
     def has(self, bits: int) -> bool:

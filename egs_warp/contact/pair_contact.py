@@ -28,9 +28,8 @@ BODY_INFLATION = 1.0
 """Inflation of the bounding box of each body, in multiples of its activation distance."""
 TET_INFLATION = 2.0
 """Inflation of the bounding boxes of the tetrahedra, in multiples of the activation distance. It equals the gap at
-which a selected point is dropped. Parts of a body that are further outside its cage cannot be touched, because elements
-extrapolate badly.
-"""
+which a selected point is dropped. Parts of a body that are further outside its cage cannot be touched, because the
+extrapolation of elements is inaccurate there."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class PairBody:
     geometry: ContactGeometry
     """Cage at rest and contact points."""
     selector: ContactSelector
-    """Cells of the contact points, activation distance and hysteresis."""
+    """Cells of the contact points, with the activation distance and the hysteresis of the selection."""
     level_set: LevelSet
     """Level set of the shape at rest."""
     rest_positions: np.ndarray
@@ -248,7 +247,7 @@ def _box_weights(body: PairBody) -> np.ndarray | None:
 
 
 class _DeformedBody(DeformedShape):
-    """The deformed shape of a body, its contact points, and buffers of their gaps."""
+    """Deformed shape of a body, its contact points, and buffers for their gaps."""
 
     def __init__(self, body: PairBody, device: wp.Device) -> None:
         geometry, mesh = body.geometry, body.geometry.mesh

@@ -178,7 +178,7 @@ class _TransferBuffers:
         self.previous = [as_warp(each, wp.int32) for each in (self._points, self._counts, self._loaded)]
         candidates = torch.zeros((1, capacity + cells), dtype=torch.int32, device=device)
         self.candidates = as_warp(candidates, wp.int32)
-        # An even number of contacts aligns the records.
+        # With an even number of contacts, the records are aligned.
         widths = [round_up(count, 2) for count in (capacity + cells, cells)]
         sizes = [_RECORD_SIZE * width + 1 for width in widths]
         self._packed = torch.zeros(sum(sizes), dtype=torch.float64, device=device)

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     import torch
 
 MAX_CELLS_AT_REST = 32
-"""Maximum number of cells that touch the ground at rest. The cage cannot resolve more forces than it has nodes
-there.
-"""
+"""Maximum number of cells that touch the ground at rest. The cage cannot resolve more contact forces than it has nodes
+there."""
 _MIN_SPACING = 0.4
 """Minimum spacing of the cells in mean edge lengths of the cage, so that small feet stand on several cells."""
 GAP_TOLERANCE_FRACTION = 1e-7
@@ -83,7 +82,7 @@ class ContactSelector:
         sole = np.flatnonzero(heights < heights.min() + 2.0 * activation_distance)
         spacing = _MIN_SPACING * mean_edge_length(geometry.mesh)
         self.cell_from_point, away = _few_cells(positions, heights, sole, spacing, MAX_CELLS_AT_REST)
-        # Sorted by cell, those closest to the cell centre first.
+        # The points are sorted by cell; within a cell, those closest to its centre come first.
         order = np.lexsort((np.rint(away / self.gap_tolerance), self.cell_from_point))
         self.cell_count = int(self.cell_from_point.max()) + 1
         bounds = np.searchsorted(self.cell_from_point[order], np.arange(self.cell_count + 1))

@@ -40,7 +40,9 @@ class BatchedRecord:
 
     @classmethod
     def concatenated(cls, records: Sequence[Self]) -> Self:
-        """Return the record of the worlds of all ``records``. Fields that are not arrays are those of the first."""
+        """Return the record of the worlds of all ``records``. Fields that are not arrays are taken from the first
+        record.
+        """
         names = [name for name, _ in records[0].batched_fields()]
         columns = {name: _concatenated([getattr(record, name) for record in records]) for name in names}
         return replace(records[0], **columns)
@@ -56,7 +58,7 @@ class BatchedRecord:
             rows = getattr(values, name)
             if isinstance(value, BatchedRecord):
                 value.scatter(worlds, rows)
-            elif rows is not value:  # Records of all worlds may share a tensor, see ``subset``.
+            elif rows is not value:  # The records of all worlds may share a tensor, see ``subset``.
                 value[worlds] = rows
 
     def download(self) -> list[Self]:
@@ -77,14 +79,16 @@ class BatchedRecord:
         return self._with_leaves([part.reshape(each.shape) for part, each in zip(columns, leaves, strict=True)])
 
     def _leaves(self) -> list[Any]:
-        """Return the arrays of this record and of its nested records."""
+        """Return the arrays of this record and of its nested records, in the order of the fields."""
         leaves = []
         for _, value in self.batched_fields():
             leaves += value._leaves() if isinstance(value, BatchedRecord) else [value]
         return leaves
 
     def _with_leaves(self, leaves: list[Any]) -> Self:
-        """Return this record with other ``leaves``, in the order of ``_leaves``; they are removed from the list."""
+        """Return this record with its arrays replaced by the first of the ``leaves``, in the order of ``_leaves``. The
+        arrays that are used are removed from the list.
+        """
         return replace(
             self,
             **{

@@ -45,10 +45,10 @@ class GraphStream:
         self._first: torch.cuda.CUDAGraph | None = None
 
     def __enter__(self) -> None:
-        """Make this PyTorch's current stream and disable gradients."""
+        """Make this stream PyTorch's current stream, and disable gradients, within the context."""
         key, entered = None if self._stream is None else self._stream.cuda_stream, _entered.contexts
         context = ExitStack()
-        # Switching PyTorch's stream costs more than a small operation, so nested entries do nothing.
+        # Switching PyTorch's stream costs more than a small operation, so a nested entry does nothing.
         if not entered or entered[-1][0] != key:
             context.enter_context(torch.no_grad())
             if self._stream is not None:

@@ -59,7 +59,7 @@ class Dissection:
 
 
 def _levels(graph: sparse.csr_matrix) -> np.ndarray:
-    """Return (n,) int, the distance of each vertex from one end of the ``graph``, in edges.
+    """Return (n,) int, the distance of each vertex in edges from one end of the ``graph``.
 
     Vertices that are not connected to this end form one additional level.
     """

@@ -30,7 +30,7 @@ class LinearSolver(Protocol):
     """Direct solver for symmetric matrices S of one sparsity pattern, plus an optional low-rank term."""
 
     is_asynchronous: bool
-    """True if ``factor`` only queues its work."""
+    """True if ``factor`` only queues its work and returns before it is done."""
 
     @property
     def stream(self) -> AbstractContextManager[None]:

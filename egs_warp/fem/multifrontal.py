@@ -68,10 +68,9 @@ class SymbolicFactorization:
 class MultifrontalLdl:
     """Multifrontal L D L^T solver for symmetric matrices of one pattern; implements ``LinearSolver``.
 
-    The symbolic analysis is done once. Results are bitwise equal on any number of cores.
-
-    There is no pivoting, because positive definite matrices need none. The factors of an indefinite matrix serve only
-    to compute its inertia and to add the muscles' stiffness. A nearly singular matrix is reported as having no factors.
+    The symbolic analysis is done once. Results are bitwise equal on any number of cores. There is no pivoting, because
+    positive definite matrices need none. The factors of an indefinite matrix serve only to compute its inertia and to
+    add the muscles' stiffness. A nearly singular matrix is reported as having no factors.
     """
 
     is_asynchronous = False
@@ -170,8 +169,8 @@ class MultifrontalLdl:
         through = self.solve(across)
         small = across.T @ through
         small[np.diag_indices_from(small)] += 1.0 / rates
-        # Haynsworth's inertia additivity: negative eigenvalues of the sum = negative eigenvalues of S + positive
-        # eigenvalues of the small matrix - positive rates.
+        # Haynsworth's inertia additivity: the number of negative eigenvalues of the sum is that of S, plus the number
+        # of positive eigenvalues of the small matrix, minus the number of positive rates.
         positive, inverse = inverse_and_positives(small)
         if self.negative_pivots + positive != int((rates > 0.0).sum()):
             return False

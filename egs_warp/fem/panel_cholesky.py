@@ -18,8 +18,8 @@ CHUNK_BYTES = 2**31
 
 
 class PanelCholesky:
-    """Dense Cholesky solver for the matrices of several worlds, which all have the same pattern. Its methods resemble
-    ``LinearSolver``, with a world axis.
+    """Dense Cholesky solver for the matrices of several worlds, which all have the same pattern. Its methods are those
+    of ``LinearSolver`` with a world axis.
 
     The factorization is left-looking and proceeds by panels: each panel is updated with all columns before it, its
     diagonal block is factored, and the rows below are multiplied by the inverse of that factor. The inverses are

@@ -273,7 +273,7 @@ class _InverseFactor:
         self.matrix, self.inverse = torch.zeros((2, count, count), dtype=torch.float64, device=device)
         """(n, n) each: the matrix S in the order of the dissection, of which only the lower triangle is read, and R.
         """
-        # The keys are numbers of directions k.
+        # The keys are the numbers k of directions.
         self._small: dict[int, tuple[_TriangularInverse, _TriangularInverse]] = {}
         self._tiled = (
             TiledInverseFactor(dissection, self.matrix, self.inverse, stream) if device.type == "cuda" else None
@@ -391,11 +391,13 @@ class TiledInverseFactor:
 
 
 class _TriangularInverse:
-    """Inverse of a lower triangular matrix: small diagonal blocks in parallel, then pairs of blocks recursively."""
+    """Inverse of a lower triangular matrix: small diagonal blocks are inverted in parallel, then pairs of blocks
+    recursively.
+    """
 
     def __init__(self, count: int, stream: GraphStream) -> None:
         pairs = max(0, math.ceil(math.log2(count / kernels.MAX_ROWS)))
-        # Even, as kernels load two numbers at once.
+        # The size is even, because kernels load two numbers at once.
         side = 2 * math.ceil(count / 2 ** (pairs + 1))
         size = side * 2**pairs
         self._count, self._side, self._size, self._stream = count, side, size, stream

@@ -24,7 +24,8 @@ _ROW_STEP = 32
 _BOUND_TOLERANCE = 1e-8
 """Tolerance of the bounds of a row, multiplied by the row's norm in z if that exceeds 1."""
 _INFEASIBLE_COST = 1e6
-"""Multiple of ``WhitenedQp.objective_drop``. Bounds that raise the objective by more than this are infeasible."""
+"""Increase of the objective, in units of ``WhitenedQp.objective_drop``, above which bounds are treated as
+infeasible."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class WhitenedQp:
     root: np.ndarray
     """(n, n) upper triangular U."""
     unit_rows: np.ndarray
-    """(m, n) rows in z, each of length 1 or 0."""
+    """(m, n) rows in z, scaled to length 1; zero rows stay zero."""
     minimum: np.ndarray
     """(n,) x0, the unconstrained minimum."""
     values_at_minimum: np.ndarray
@@ -98,7 +99,7 @@ class Optimum:
 
 
 class _Workspace:
-    """Reused memory for QPs of at most ``rows`` rows and ``unknowns`` unknowns."""
+    """Workspace that is reused for all QPs of at most ``rows`` rows and ``unknowns`` unknowns."""
 
     def __init__(self, rows: int, unknowns: int) -> None:
         self._device, self._unknowns = wp.get_device("cpu"), unknowns

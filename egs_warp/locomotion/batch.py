@@ -295,8 +295,9 @@ class BatchStepper:
     def _rank_half_steps(
         self, state: BatchState, done: list[BatchStep], objectives: BatchObjectives
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (c,) bool, True where a step of ``done`` did not converge, and (c,), the objective value at the end of
-        the last step. ``state`` is the state before these steps."""
+        """Return (c,) bool, True where a step of ``done`` did not converge, and the objective values (c,) at the end of
+        the last step. ``state`` is the state before these steps.
+        """
         positions, velocities = state.positions.clone(), state.velocities.clone()
         unconverged = torch.zeros(len(state.worlds), dtype=torch.bool, device=self.device)
         value = torch.zeros(len(state.worlds), dtype=torch.float64, device=self.device)

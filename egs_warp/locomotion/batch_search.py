@@ -39,7 +39,7 @@ from egs_warp.worker_threads import run_all
 POOL, RELAXATION_POOL = 512, 256
 """Maximum number of worlds in a launch of the search, and in a launch that computes relaxed optima."""
 _STATUS, _COUNT, _INFEASIBLE, _OBJECTIVE, _HAS_POINT = range(5)
-"""Entries of the header of a packed result."""
+"""Number of entries of the header of a packed result."""
 
 
 @dataclass(frozen=True)

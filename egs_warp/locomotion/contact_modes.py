@@ -66,7 +66,9 @@ class CoulombProgram:
         return float(0.5 * x @ self.P @ x + self.q @ x + self.constant)
 
     def contact_response(self, activations: np.ndarray, guess: np.ndarray) -> np.ndarray:
-        """Return x = (a, f(a)), (m + 3n,), for ``activations`` (m,). The Coulomb solve starts from ``guess`` (n, 3)."""
+        """Return x = (a, f(a)), (m + 3n,), for ``activations`` a (m,). The Coulomb solve starts from the forces
+        ``guess`` (n, 3).
+        """
         m, n = self.activation_count, self.contact_count
         operator = regularized(self.rows[:, m:], kernels.DELASSUS_REGULARIZATION)
         free = self.offset + self.rows[:, :m] @ activations
@@ -114,7 +116,7 @@ class ModeRegionOptimum:
     objective: float
     """Objective at ``x``."""
     contact: np.ndarray
-    """(k,) contact of each active mode constraint that raises the objective."""
+    """(k,) contact of each active mode constraint with a significant multiplier."""
     transition: np.ndarray
     """(k,) transition that the contact makes beyond the constraint, as in ``ModeRegion``."""
     multiplier: np.ndarray
@@ -147,9 +149,9 @@ def search_modes(
     and repeat while the objective decreases.
 
     The optimum of a region lies on its boundary with the next region, so each QP has a feasible start. The search
-    begins in the region in which the sliding contacts of ``modes`` stick. The reason: a sliding foot resists in one
-    direction only, and from a region in which the feet slide apart the search does not reach a push-off with all feet.
-    If the first region has no solution, the search begins in the region of ``modes`` itself.
+    begins in the region in which the sliding contacts of ``modes`` stick, because a sliding foot resists in one
+    direction only: from a region in which the feet slide apart, the search does not reach a push-off with all feet. If
+    the first region has no solution, the search begins in the region of ``modes`` itself.
 
     Args:
         program: the QP of the step.
@@ -271,7 +273,7 @@ class ModeRegion:
         forces = forces_in_modes(program.rows, program.offset, mu, modes)
         if forces is None:
             return None
-        # x = (a, f) as an affine function of the activations, with the constant in the last column.
+        # Affine map from the activations to x = (a, f), with the constant in the last column.
         x = np.vstack([np.eye(m, m + 1), forces])
         products = program.P @ x
         cost = x.T @ products

@@ -151,7 +151,8 @@ class PlanWorkspace:
         self._velocities, self._contact_velocities = zeros(size, m + width + 1), zeros(width, m + width + 1)
         self._form = zeros(m + width + 1, m + width + 1)
         self._entries, self._gradient, self._energy = zeros(len(owner.factors.places)), zeros(size), zeros(1)
-        # The read-back is one array: checks of the prediction and of the search, result of the search, forces, and end.
+        # The read-back is one array: checks of the prediction and of the search, result of the search, contact forces,
+        # and end of the step.
         lengths = [
             4,
             PREDICTION_ITERATIONS + 2,
@@ -184,7 +185,7 @@ class PlanWorkspace:
             body, newton, self._search, self._contact_velocities, self._predicted_forces, qp_limit=limit
         )
         self._objective, self._is_restart_parallel = 0.0, False
-        # 1 if the solve starts from the end of the first search.
+        # (1,) int32, 1 if the solve starts from the end of the first search.
         self._starts_solve = torch.zeros(1, dtype=torch.int32, device=body.factors.device)
         self._graphs, self._plan_event = GraphCache(body.stream), None
 
@@ -277,7 +278,7 @@ class PlanWorkspace:
             if final.x is None:
                 return None
             count, infeasible = final.qp_count, final.infeasible
-            # The device is at the end of the first search.
+            # The device already holds the end of the first search.
             if final.x is not x:
                 self._replace_end(final.x, start)
                 *_, (_, residual_norm, coulomb_violation), _, _, forces, contact_velocities, velocities = self._parts

@@ -26,8 +26,8 @@ from egs_warp.precision import real
 CAPACITY_MULTIPLE = 8
 """Contact capacities are multiples of this."""
 WORLD_BLOCK = 128
-"""Number of threads in the block of each world on a GPU. It is smaller than for a single world, so that several blocks
-share a multiprocessor."""
+"""Number of threads in the block of each world on a GPU. It is smaller than that of a single world, so that several
+blocks share a multiprocessor."""
 
 
 def search_modes_device(
@@ -65,7 +65,7 @@ class ModeSearchWorkspace:
         self.packed_qp = zeros(packed_qp_size(m, n), dtype=real)
         self.packed_result, self.is_accepted = zeros(kernels.HEADER_SIZE + size, dtype=real), zeros(1, dtype=int)
         cancelled = first_search.is_accepted if first_search else zeros(1, dtype=int)
-        # The launch holds the addresses of these structs' arrays.
+        # The launch holds only the addresses of these structs' arrays.
         self._structs = [
             allocate_struct(struct, shapes, self._device, **_cancelled_by(struct, cancelled))
             for struct, shapes in mode_search_shapes(m, n).items()
@@ -124,7 +124,7 @@ class RelaxationWorkspace:
     def __init__(self, m: int, n: int, search: ModeSearchWorkspace) -> None:
         device = device_of(search.packed_qp)
         self.packed_result = wp.zeros(kernels.HEADER_SIZE + m, dtype=real, device=device)
-        # The launch holds the addresses of these structs' arrays.
+        # The launch holds only the addresses of these structs' arrays.
         self._structs = [
             allocate_struct(struct, shapes, device, **_cancelled_by(struct, search.is_accepted))
             for struct, shapes in relaxation_shapes(m, n).items()
@@ -228,7 +228,7 @@ def _active_set_shapes(rows: int, base_rows: int, unknowns: int) -> dict[Any, di
 
 
 def _cancelled_by(struct: Any, cancelled: wp.array) -> dict[str, wp.array]:
-    """Return ``cancelled`` by the name of its field if ``struct`` has such a field."""
+    """Return ``cancelled`` under the name of its field if ``struct`` has such a field, else an empty dictionary."""
     return {"cancelled": cancelled} if struct is UnitConstraints else {}
 
 

@@ -230,9 +230,9 @@ class _Elements:
     volumes: np.ndarray
     """(T,) m^3, volumes at rest times the relative stiffness, to which all terms of an element are proportional."""
     mu: float
-    """Pa, Lame parameter."""
+    """Shear modulus mu, Pa."""
     lam: float
-    """Pa, Lame parameter."""
+    """Lame's first parameter lambda, Pa."""
     damping_time: float
     """Rayleigh coefficient beta, s."""
 
@@ -270,7 +270,7 @@ class _Elements:
             log_j = np.log(np.linalg.det(F1))
         elastic = self.mu * F1 + (self.lam * log_j - self.mu)[:, None, None] * np.swapaxes(inverse, 1, 2)
         force = elastic + F1 @ stress
-        # Torque, the sum of x0 x (-P g) V over the corners; F0 is the sum of x0 outer g over them.
+        # The torque is the sum of x0 x (-P g) V over the corners; F0 is the sum of x0 g^T over the corners.
         turning = -np.einsum("t,tij,tkj->ik", self.volumes, F0, force)
         return _Strain(
             -dt * float(self.volumes @ (stress * rate).sum(axis=(1, 2))),
@@ -289,7 +289,7 @@ class _Elements:
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             log_change = np.log(np.linalg.det(np.eye(3) - relative))
-        curved = log_change + _trace(relative)  # about -tr(A A) / 2 for a small step
+        curved = log_change + _trace(relative)  # For a small step this is about -tr(A A) / 2.
         squares = self.mu * (change * change).sum(axis=(1, 2)) + self.lam * log_change**2
         return 0.5 * squares + (self.lam * log_j - self.mu) * curved
 
@@ -333,9 +333,9 @@ class _Muscles:
         share = 3.0 * limb**2 - 2.0 * limb**3
         work = tension * (self._pulled(long) - self._pulled(short))
         directions = end / np.maximum(short, 1e-300)[:, None]
-        # Implicit Euler applies the force at the end of the step, share T u1, throughout the step. The loss is T (W0 -
-        # W1 + share u1.(x1 - x0)), where W is the length over which the full tension does the same work. The loss has
-        # two parts: the rotation of the line, and the change of ``share`` below 0.7 of the rest length.
+        # Implicit Euler applies the force at the end of the step, ``share`` T u1, throughout the step. The loss is T
+        # (W0 - W1 + share u1.(x1 - x0)), where W is the length over which the full tension does the same work. The loss
+        # has two parts: the rotation of the line, and the change of ``share`` below 0.7 of the rest length.
         turned = 0.5 * share * long * ((start / np.maximum(long, 1e-300)[:, None] - directions) ** 2).sum(axis=1)
         weakened = self._pulled(long) - self._pulled(short) - share * (long - short)
         torque = -np.cross(start, (tension * share)[:, None] * directions).sum(axis=0)

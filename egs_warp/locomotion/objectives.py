@@ -23,7 +23,9 @@ from egs_warp.geometry.frames import cross_matrices, orthonormal_basis
 
 @dataclass(frozen=True)
 class Objective:
-    """Objective weight |rows v - target|^2 on the end velocity v, in m/s, so that weights are comparable."""
+    """Objective that costs ``weight`` |rows v - target|^2 for the end velocity v, in m/s, so that weights are
+    comparable.
+    """
 
     name: str
     rows: sparse.csr_matrix | np.ndarray
@@ -51,10 +53,11 @@ def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -
 
 @dataclass(frozen=True)
 class AngularMomentumObjective:
-    """Objective weight |L+ - target|^2 / (m r)^2 on the angular momentum L+ about the centre of mass at the end of the
-    step, with the radius of gyration r.
+    """Objective that costs ``weight`` |L+ - target|^2 / (m r)^2 for the angular momentum L+ about the centre of mass at
+    the end of the step, with the radius of gyration r.
 
-    The stepper conserves L+ = L + dt sum (x - c) x f (docs/concepts/body.md), so only contact forces change it.
+    The stepper conserves L+ = L + dt sum (x - c) x f (docs/concepts/body.md), so only contact forces change the angular
+    momentum.
     """
 
     target: np.ndarray
@@ -86,7 +89,8 @@ class AngularMomentumObjective:
 
 @dataclass(frozen=True)
 class LoadObjective:
-    """Objective weight times the squared load, as a fraction of the body weight, of each contact at the ``nodes``.
+    """Objective that costs ``weight`` times the squared load, as a fraction of the body weight, of each contact at the
+    ``nodes``.
 
     A loaded contact stays closed, whatever the target velocity of its nodes is. So a foot must be unloaded before it is
     lifted.
@@ -162,7 +166,7 @@ def strain_modes(second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     roots = np.sqrt(np.maximum(moments, 0.0))[..., None, :]
     floor = _MIN_MODE * roots.max(axis=-1, keepdims=True)
     inverse = np.where(roots > floor, 1.0 / np.maximum(roots, floor), 0.0)
-    # With C = A half and D = B half, half half^T = second, the mean of (A a) . (B a) is the sum of C_ij D_ij.
+    # With half half^T = second, C = A half and D = B half, the mean of (A a) . (B a) is the sum of C_ij D_ij.
     coordinates = (_LINEAR_MODES @ (axes * roots)[..., None, :, :]).reshape(*second.shape[:-2], 9, 9)
     orthonormal, triangle = np.linalg.qr(coordinates.swapaxes(-1, -2))
     sizes = np.abs(np.diagonal(triangle, axis1=-2, axis2=-1))
@@ -182,7 +186,7 @@ def _linear_modes() -> np.ndarray:
 
 
 _LINEAR_MODES, _MIN_MODE = _linear_modes(), 1e-6
-"""Rotations and strains; minimum norm of an independent strain mode relative to the largest one."""
+"""Matrices of rotations and strains, and minimum norm of an independent strain mode relative to the largest one."""
 
 
 @dataclass(frozen=True)
@@ -340,7 +344,7 @@ def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, w
     """
     plane = np.stack(orthonormal_basis(up))
     hull = ConvexHull(state.positions[part.nodes] @ plane.T)
-    corners = part.nodes[hull.vertices]  # anticlockwise in two dimensions
+    corners = part.nodes[hull.vertices]  # SciPy lists them anticlockwise.
     flat = state.positions[corners] @ plane.T
     following, preceding = np.roll(flat, -1, axis=0), np.roll(flat, 1, axis=0)
     perimeter = float(np.linalg.norm(following - flat, axis=1).sum())

@@ -125,5 +125,5 @@ def _pivots(
 
 
 def _key(modes: ContactModes) -> bytes:
-    """Return the kinds and the directions of the sliding contacts, for comparison."""
+    """Return a key of the modes: their kinds, and the directions of the sliding contacts."""
     return modes.kind.tobytes() + np.where(modes.kind[:, None] == SLIDE, modes.slip, 0.0).tobytes()

@@ -14,7 +14,7 @@ from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.threads import one_blas_thread
 
 SETTLING_STEP, SETTLING_STEPS = 0.25, 12
-"""Step size in sqrt(H / g), and maximum number of steps, in which a body comes to rest on its ground."""
+"""Step size in sqrt(H / g), and maximum number of steps, for a body that comes to rest on its ground."""
 SHAPE_TOLERANCE = 1e-3
 """Maximum displacement of a node of the resting body from the captured shape, in body heights."""
 

@@ -128,7 +128,8 @@ class SplittingProgram:
         """Solve with bounds ``lower``, ``upper`` (m,), see ``QuadraticProgram.solve``."""
         start = self._start if start is None else start
         if (upper - lower < _EQUALITY_WIDTH).any():
-            # The equality rows of contact states may be redundant, so they are satisfied approximately, not exactly.
+            # The equality rows of contact states may be redundant, so they are satisfied approximately instead of
+            # exactly.
             return self._solve_by_splitting(lower, upper, start)
         rows = self._rows
         lower, upper = lower - self._padding, upper + self._padding
@@ -234,7 +235,7 @@ class DaqpProgram:
             2: QpStatus.INEXACT,
             -1: QpStatus.INFEASIBLE,
             -4: QpStatus.ITERATION_LIMIT,
-            -6: QpStatus.INFEASIBLE,  # equality rows contradict each other
+            -6: QpStatus.INFEASIBLE,  # Equality rows contradict each other.
         }.get(flag, QpStatus.FAILED)
         return _solution(status, self._P, self._q, x, multipliers, len(lower))
 

@@ -19,7 +19,7 @@ from egs_warp.locomotion.linear_step import LinearStep
 from egs_warp.locomotion.objectives import AnyObjective, Objective
 
 EFFORT_WEIGHT = 1.0
-"""Cost of an elastic energy and damping potential of m g H in total."""
+"""Cost of a total of m g H of elastic energy and damping potential."""
 EFFORT_HORIZON = 0.16
 """Time in sqrt(H / g) after the start of a step at which the elastic energy is evaluated. A horizon of one step is too
 short: a body that holds itself bent gains almost nothing by releasing the strain for one step."""
@@ -55,6 +55,7 @@ def objectives_cost(
         contacts: contacts whose forces are the last unknowns.
         objectives: objectives of the motion.
         speed: unit of speed sqrt(g H), m/s.
+
     Returns:
         A function that returns the cost as a function of x, and blocks until it is available.
     """

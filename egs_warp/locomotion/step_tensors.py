@@ -57,7 +57,8 @@ def write_linear_step(
 
 @dataclass(frozen=True)
 class WeightedRows(BatchedRecord):
-    """Rows and targets of objectives on the end velocity, times sqrt(2 weight): rows with one entry, and dense rows.
+    """Rows and targets of objectives on the end velocity, multiplied by sqrt(2 weight): rows with one entry, and dense
+    rows.
 
     Padding with zeros has no effect.
     """

@@ -40,8 +40,8 @@ from egs_warp.short_repr import short_repr
 MAX_HALVINGS = 4
 """Maximum number of successive halvings of a step that does not converge."""
 REPLAN_FACTOR, REPLAN_MARGIN = 1.2, 0.01
-"""A step is replanned if its objectives cost more than this factor times the value that the plan expects, plus this
-margin."""
+"""A step is replanned if its objectives cost more than the first value times the cost that the plan expects, plus the
+second value."""
 
 
 @dataclass(frozen=True)
@@ -319,7 +319,7 @@ class LocomotionStepper:
         problem = start.problem
         clock.lap("detect")
         response, plan = self._plan(start, objectives, clock)
-        # A GPU already runs the solve meanwhile.
+        # Meanwhile a GPU already runs the solve.
         expected = self._objective_value(problem, objectives, response.contacts, plan)
         result = self._solve(response, plan)
         clock.lap("solve")

@@ -33,7 +33,7 @@ RESTART_COST = 0.3
 
 
 class Strategy(Enum):
-    """Search for the contact modes of a step."""
+    """Strategy that searches for the contact modes of a step."""
 
     MODES = "modes"
     """Search from the predicted modes, changing all contacts at once, with the exact friction cone (``search_modes``).

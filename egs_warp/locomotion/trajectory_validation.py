@@ -62,7 +62,7 @@ MAX_BODIES = 10_000
 """Maximum number of bodies of a world; ``contact_plane`` is -1 - k for contacts with body k."""
 _POSITIVE = ("node_mass", "height", "metres_per_unit", "ground_spacing", "dt", "relative_stiffness")
 _MAY_BE_NAN = ("planned_com", "min_gap")
-"""Arrays that may contain NaN: where there is no plan or no contact point."""
+"""Arrays that may contain NaN, for states without a plan or contact points."""
 
 
 def check_trajectory(t: Trajectory) -> None:

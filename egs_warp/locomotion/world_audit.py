@@ -139,7 +139,7 @@ class ContactShape:
         rest = self.rest_positions[nodes]
         values, gradients = self.signed_distance(np.einsum("nw,nwi->ni", weights, rest))
         rest_edges, edges = rest[:, 1:] - rest[:, :1], positions[:, 1:] - positions[:, :1]
-        # The rows e of the edges satisfy e . F^-T grad = E . grad for the edges E at rest.
+        # The edges e and their rest vectors E satisfy e . F^-T grad = E . grad.
         g = np.linalg.solve(edges, rest_edges @ gradients[:, :, None])[:, :, 0]
         lengths, slopes = np.linalg.norm(g, axis=1), np.linalg.norm(gradients, axis=1)
         return values / (lengths * np.maximum(1.0, _MIN_SLOPE / slopes)), g / lengths[:, None]
@@ -189,7 +189,7 @@ class WorldAudit:
     momentum_residual: float
     """Change of the linear momentum minus the impulses of gravity, ground, pushes and drag, in M sqrt(g H)."""
     angular_momentum_residual: float
-    """The same for the angular momentum about the origin, in M H sqrt(g H)."""
+    """Change of the angular momentum about the origin minus the same impulses, in M H sqrt(g H)."""
     pairs: tuple[PairAudit, ...]
     """Audit of each pair, in ascending order."""
 

@@ -23,10 +23,11 @@ def split_kernel(
     log_scales_out: wp.array[wp.vec3],
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Write a copy of Gaussian ``parents[row]``, or, where ``axes[row]`` is not -1, one of its children.
+    """Write row by row either a copy of the Gaussian ``parents[row]`` or, where ``axes[row]`` is not -1, one of its
+    children.
 
-    A child is displaced along the axis ``axes[row]`` by ``offsets[row]`` standard deviations of the parent. Its
-    standard deviation along this axis is ``shrink`` times the standard deviation of the parent.
+    A child is displaced along the axis ``axes[row]`` of the parent by ``offsets[row]`` standard deviations. Its
+    standard deviation along this axis is ``shrink`` times that of the parent.
     """
     row = first_row + wp.tid()
     parent = parents[row]

@@ -6,7 +6,7 @@ these arguments, for B worlds, T elements and N nodes:
 * ``tets`` (T,): nodes of each element.
 * ``rest_inverses`` (T,) 1/m: inverse edge matrices at rest.
 * ``volumes`` (T,) m^3: volumes at rest.
-* ``mu``, ``lam``: Lame parameters, Pa.
+* ``mu``, ``lam``: shear modulus and Lame's first parameter, Pa.
 * ``damping_time``: Rayleigh coefficient beta, s.
 * ``start_gradients`` (B, T): deformation gradients at the start of the step; not read if ``dt`` is 0.
 * ``positions`` (B, N) m: nodes at the end of the step.
@@ -117,8 +117,8 @@ def damping_block(
         rotation_term: g_a.S g_b, the factor of I that stems from the derivative of F. The other terms stem from the
             derivative of the stress S (``damping_stress``).
         dt: step size, s.
-        mu: second Lame parameter, Pa.
-        lam: first Lame parameter, Pa.
+        mu: shear modulus, Pa.
+        lam: Lame's first parameter lambda, Pa.
     """
     material = mu * (along * stretch + wp.outer(f_b, f_a)) + lam * wp.outer(f_a, f_b)
     return material / dt + rotation_term * wp.identity(n=3, dtype=wp.float64)

@@ -86,9 +86,9 @@ class Elements:
     only their upper triangles.
     """
     mu: real
-    """First Lame parameter, Pa."""
+    """Shear modulus mu of Eq. (5), Pa."""
     lam: real
-    """Second Lame parameter, Pa."""
+    """Lame's first parameter lambda of Eq. (5), Pa."""
     damping_time: real
     """Rayleigh coefficient beta, s."""
 

@@ -15,7 +15,7 @@ def mean_colour_kernel(
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """Compute the mean of each Gaussian's unclipped colour over unit viewing ``directions`` (from the camera)."""
+    """Compute the mean of each Gaussian's unclipped colour over the ``directions``, unit vectors from the camera."""
     g = wp.tid()
     colour = wp.vec3()
     for k in range(directions.shape[0]):

@@ -16,8 +16,9 @@ def surface_distance_kernel(
     # Out:
     distances_out: wp.array[float],
 ):
-    """Compute the signed distance of each point from ``mesh``: negative where the winding number is above one half, and
-    ``max_distance`` where no triangle is nearer than that."""
+    """Compute the signed distance of each point from ``mesh``. It is negative where the winding number is above one
+    half, and ``max_distance`` where no triangle is nearer than that.
+    """
     i = first_row + wp.tid()
     query = wp.mesh_query_point_sign_winding_number(mesh, points[i], max_distance)
     distance = max_distance
@@ -38,7 +39,7 @@ def unsigned_distance_kernel(
     # Out:
     distances_out: wp.array[float],
 ):
-    """Compute the distance of each point from ``mesh``, at most ``max_distance``."""
+    """Compute the distance of each point from ``mesh``, limited to ``max_distance``."""
     i = first_row + wp.tid()
     query = wp.mesh_query_point_no_sign(mesh, points[i], max_distance)
     distance = max_distance

@@ -1,4 +1,7 @@
-"""Extent of Gaussians across a plane, and truncation of Gaussians at a plane."""
+"""Kernels that measure the extent of Gaussians across a plane, and that truncate Gaussians at a plane.
+
+The plane is normal.x + offset = 0, with the unit ``normal`` N.
+"""
 
 import warp as wp
 
@@ -22,8 +25,9 @@ def extent_kernel(
     axis_reach_out: wp.array[wp.float32],
     deviation_out: wp.array[wp.float32],
 ):
-    """Compute the height of each mean above the plane, the largest |N.(s_i r_i)| (Eq. 20 divided by gamma) and the
-    standard deviation along N."""
+    """Compute the height of each mean above the plane, the largest |N.(s_i r_i)| of its axes (Eq. 20 divided by gamma),
+    and the standard deviation along N.
+    """
     row = first_row + wp.tid()
     along = wp.transpose(rotation_matrix(rotations[row])) * normal
     s = log_scales[row]
@@ -50,8 +54,8 @@ def half_space_kernel(
     log_scale_out: wp.array[wp.vec3],
     opacity_logit_out: wp.array[wp.float32],
 ):
-    """Compute mass, mean and covariance of the part of Gaussian ``source`` on the side of the plane to which the normal
-    points.
+    """Compute the opacity, the mean and the shape of the part of each Gaussian ``source[row]`` on the side of the plane
+    to which the normal points.
 
     With A = R S and w = A^T N / sigma, Sigma - c Sigma N N^T Sigma / sigma^2 = A' A'^T for A' = A (I - (1 - sqrt(1 -
     c)) w w^T). The factor A' is decomposed instead of the covariance, whose rounding errors exceed the smallest

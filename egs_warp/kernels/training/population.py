@@ -1,4 +1,4 @@
-"""Updates of all Gaussians in every training step, other than Adam's.
+"""Updates of all Gaussians in every training step, besides those of Adam.
 
 Host code: ``egs_warp/training/relocation.py``.
 """
@@ -28,7 +28,9 @@ def regularization_kernel(
     opacity_gradient_out: wp.array[wp.float32],
     scale_gradient_out: wp.array[wp.vec3],
 ):
-    """Add the derivatives of ``by_opacity`` times the opacities and ``by_scale`` times the scales to the gradients."""
+    """Add the derivatives of the regularisation to the gradients: ``by_opacity`` times the sum of the opacities, and
+    ``by_scale`` times the sum of the scales.
+    """
     n = first_row + wp.tid()
     opacity = sigmoid(opacity_logits[n])
     opacity_gradient_out[n] = opacity_gradient_out[n] + by_opacity * opacity * (1.0 - opacity)
@@ -47,11 +49,12 @@ def jitter_kernel(
     opacity_logits: wp.array[wp.float32],
     means_out: wp.array[wp.vec3],
 ):
-    """Move each mean by ``size`` times its covariance times ``noise``. The displacement is smaller for more opaque
-    Gaussians."""
+    """Displace each mean by ``size`` times its covariance times ``noise``. The displacement is smaller for Gaussians
+    with opacities above ``faint``.
+    """
     n = first_row + wp.tid()
     gate = sigmoid(-STEEPNESS * (sigmoid(opacity_logits[n]) - faint))
-    # Below this value, the displacement has no visible effect.
+    # Smaller displacements have no visible effect.
     if gate > 1.0e-6:
         turn = rotation_from_quaternion(rotations[n])
         local = wp.transpose(turn) * noise[n]
