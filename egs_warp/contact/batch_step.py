@@ -26,7 +26,7 @@ from egs_warp.precision import Vec3, real
 
 
 class StageTimer(Protocol):
-    """Protocol of a timer for the stages of a step."""
+    """Protocol of a timer that measures the stages of a step."""
 
     def __call__(self, name: str) -> AbstractContextManager[object]:
         """Return a context that measures the stage ``name``."""
@@ -34,7 +34,7 @@ class StageTimer(Protocol):
 
 
 def no_timer(name: str) -> AbstractContextManager[object]:
-    """Return an empty context: a ``StageTimer`` that measures nothing."""
+    """Return an empty context; a ``StageTimer`` that measures nothing."""
     return nullcontext()
 
 
@@ -53,7 +53,7 @@ class BatchLinearization(BatchedRecord):
 
 @dataclass(frozen=True)
 class BatchInputs(BatchedRecord):
-    """Inputs of Newton's method in c worlds."""
+    """Inputs of Newton's method for one step in each of c worlds."""
 
     problem: BatchProblem
     contacts: ContactSet

@@ -46,7 +46,7 @@ class ContactSet(BatchedRecord):
     """(n,) or (B, K) m, signed distance at the start of the step."""
     faces: Any
     """(n,) or (B, K) int32, index of the contact plane of each point; 0 is the ground, flat or not. For a contact with
-    another body, -1 minus its index."""
+    another body, the value is -1 minus the index of the body."""
     node_count: int
     """Number N of nodes of a world."""
     counts: Any = None
@@ -54,7 +54,7 @@ class ContactSet(BatchedRecord):
 
     @property
     def capacity(self) -> int:
-        """Number of entries of a world, n or K."""
+        """Number of entries of each world: n of one world on the host, otherwise K."""
         return self.points.shape[-1]
 
     @property

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _Residual = TypeVar("_Residual")
 
 TOLERANCE, MAX_ITERATIONS = 1e-12, 16
-"""Residual of the projection equations, m/s, at which Newton's method ends, and its maximum number of steps."""
+"""Residual of the projection equations, m/s, at which Newton's method ends, and maximum number of Newton steps."""
 FAILURE_TOLERANCE = 1e-8
 """Residual in m/s above which the solve is treated as failed and repeated by continuation."""
 REGULARIZATION_STEPS = (1e-4, 1e-5, 1e-6, 1e-7)

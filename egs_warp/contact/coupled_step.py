@@ -1,8 +1,8 @@
 """Newton's method on the velocities and contact forces of one step (Eq. 4, 8, 9).
 
-It ends when both the equation of motion and Coulomb's law hold. A step is solved in rounds, each with a fixed contact
-set (``newton_round``). Points that would be too deep at the end of a round are added to the set for the next round. The
-iterates come from ``newton`` (host) or ``device_newton`` (GPU).
+The method ends when both the equation of motion and Coulomb's law hold. A step is solved in rounds, each with a fixed
+contact set (``newton_round``). Points that would be too deep at the end of a round are added to the set for the next
+round. The iterates come from ``newton`` (host) or ``device_newton`` (GPU).
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ class CoupledResult:
     factorization_count: int
     """Number of factorisations computed in the solve."""
     linearization: ContactLinearization
-    """The last linearisation, with the contacts at the end."""
+    """Last linearisation, with the contacts at the end of the step."""
     penetration: PenetrationCheck | None
-    """Penetration test at the end; None if it was not evaluated."""
+    """Penetration test at the end of the step; None if it was not evaluated."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ class NewtonOptions:
     def normal_bias(self, contacts: ContactSet, dt: float) -> Any:
         """Return the velocity bias added to each contact's normal velocity.
 
-        It forbids further penetration during the step. Contacts that are deeper than ``penetration_tolerance`` are
-        pushed out at a limited speed.
+        The bias forbids further penetration during the step. It pushes contacts that are deeper than
+        ``penetration_tolerance`` out at a limited speed.
 
         Args:
             contacts: active contacts.

@@ -42,17 +42,15 @@ MIN_OUTSIDE_FRACTION = 0.1
 _BISECTIONS = 40
 """Bisection steps that shorten an arm to uneven ground."""
 _HULL_BULGE = 1e-7
-"""Relative outward shift of a tetrahedron's points before the hull is computed. It is far above double rounding and far
-below the shift that would turn another point of the grid into a vertex.
-"""
+"""Relative outward shift of a tetrahedron's points before the hull is computed. The shift is far above the rounding
+error of float64, and far below the shift that would turn another point of the grid into a vertex."""
 _CACHED_CONFIGURATIONS = 4
 """Number of configurations whose gaps are cached. The gaps at the start and the end of a step are requested several
 times, and a step ends where the next one starts.
 """
 _SLACK_FRACTION = 0.25
 """Depth below a plane, as a fraction of the grid spacing, up to which a point is treated as lying on the plane, because
-rounding to the grid places it there.
-"""
+rounding to the grid can shift it by this much."""
 _SQUARE_FRACTION = 0.5
 """Side of a square, in spacings of uneven ground. In each square the lowest point of each tetrahedron is retained."""
 
@@ -224,9 +222,9 @@ def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int)
 
 
 def _bulge(places: np.ndarray) -> np.ndarray:
-    """Return the scaled offsets of ``places`` (n, 3) from their mean, lengthened slightly more the longer they are.
-    Points on an edge or face of the hull then lie strictly inside it, because |p|^2 is convex, and vertices remain
-    vertices. Without the bulge, rounding would decide which points are vertices.
+    """Return the scaled offsets of ``places`` (n, 3) from their mean, of which longer ones are lengthened by a slightly
+    larger factor. Points on an edge or face of the hull then lie strictly inside it, because |p|^2 is convex, and
+    vertices remain vertices. Without this, rounding would decide which points are vertices.
     """
     arms = places - places.mean(axis=0)
     arms /= max(float(np.abs(arms).max()), 1e-300)
@@ -267,10 +265,10 @@ class ContactDetector:
         self._record: _RecordBuffers | None = None
 
     def gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Evaluate the gaps of all points; the result is cached and read-only.
+        """Evaluate the gaps of all points. The result is cached and read-only.
 
-        The distance to a solid is the largest signed distance to its faces. The distance to uneven ground is defined by
-        ``HeightField.gaps``.
+        The distance to a solid is the largest of the signed distances to its faces. The distance to uneven ground is
+        defined by ``HeightField.gaps``.
 
         Args:
             positions: (N, 3) m.

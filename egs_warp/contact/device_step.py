@@ -177,7 +177,9 @@ class StepWorkspace:
         return self.prefetch.contacts(len(before) if self._prefetch_capacity is None else self._prefetch_capacity)
 
     def _cancel_prefetch(self) -> None:
-        """Drop a prefetch whose result was not used. Its upload may still be in flight, so this blocks."""
+        """Drop a prefetch whose result was not used. Its upload may still be in flight, so the call blocks until it is
+        done.
+        """
         if self._prefetch_points is not None:
             self._prefetch_points = None
             self.stream.wait()
@@ -207,8 +209,8 @@ class StepWorkspace:
         self.factors.enqueue_factor(wp.to_torch(entries)[0])
 
     def enqueue_stiffness(self, problem: StepProblem, tension: MuscleEnergy, velocities: np.ndarray) -> None:
-        """Add the stiffness of the muscles under ``tension`` to the factored matrix. It is evaluated at the end
-        positions for the velocities ``velocities`` (N, 3) m/s.
+        """Add the stiffness of the muscles under ``tension``, at the end positions for ``velocities`` (N, 3) m/s, to
+        the factored matrix.
         """
         segments, directions, rates = tension.hessian(problem.end_positions(velocities)).rank_one_terms(
             min_relative_stiffness=MIN_RELATIVE_STIFFNESS

@@ -73,7 +73,7 @@ class ContactLinearization:
         return coulomb_forces(self._regular, speeds, shift, friction, start)
 
     def with_added_contacts(self, contacts: ContactSet) -> ContactLinearization:
-        """Return the linearisation of ``contacts``, which begin with the current ones, with the same tangent."""
+        """Return the linearisation, with the same tangent, of ``contacts``, which begin with the current ones."""
         new = contacts.jacobian_transposed()[:, 3 * self.contacts.count :]
         columns = np.hstack([self.columns, self.tangent.problem.dt * self.tangent.solve(new)])
         return type(self).of(self.tangent, contacts, columns)

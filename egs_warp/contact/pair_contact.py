@@ -151,7 +151,7 @@ class PairContactDetector:
         return np.concatenate(found)
 
     def subset(self, members: Sequence[int]) -> PairContactDetector:
-        """Return a detector of some of the bodies. It shares the buffers of this one."""
+        """Return a detector for some of the bodies, which shares the buffers of this detector."""
         other = copy(self)
         other._set_bodies([self.bodies[i] for i in members], [self._states[i] for i in members])
         return other

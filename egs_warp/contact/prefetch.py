@@ -97,8 +97,8 @@ class ContactPrefetch:
         counts: torch.Tensor,
         loads: torch.Tensor,
     ) -> None:
-        """Queue the contact selection for the next step. It requires that ``enqueue_penetration`` was called for the
-        end of the current step; ``advance`` makes the result valid.
+        """Queue the contact selection for the next step. ``enqueue_penetration`` must have been called for the end of
+        the current step before; ``advance`` makes the result valid.
 
         Args:
             positions: (N,) m, nodes at the start and at the end of the current step.

@@ -33,9 +33,9 @@ class TrialReadback(NamedTuple, Generic[ArrayT]):
     """(3K,) m/s, contact velocities after a Newton step without contact forces from the iterate at the start of the
     last step."""
     velocities_before: ArrayT
-    """(3N,) m/s, velocities of the same iterate."""
+    """(3N,) m/s, velocities of the iterate at the start of the last step."""
     forces_before: ArrayT
-    """(3K,) newtons, contact forces of the same iterate."""
+    """(3K,) newtons, contact forces of the iterate at the start of the last step."""
 
 
 class ReadbackBuffers:

@@ -215,10 +215,10 @@ def _zeroed_fields(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: w
 
 
 class StructPerWorld:
-    """Array on a device of one Warp struct for each of B worlds, with the arrays to which they refer.
+    """Device array of Warp structs, one for each of B worlds, together with the arrays to which the structs refer.
 
-    ``structs`` (B,) is the argument of a kernel. The structs contain only the addresses of the arrays, so this
-    object must exist as long as they are used.
+    ``structs`` (B,) is the argument of a kernel. The structs contain only the addresses of the arrays, so this object
+    must exist as long as the structs are used.
     """
 
     def __init__(

@@ -111,7 +111,7 @@ class GraphStream:
     def run_while(self, work: Callable[[], None], going: torch.Tensor) -> Callable[[], None]:
         """Return a function that repeats ``work`` while ``going`` (1,) int32, which ``work`` updates, is not 0.
 
-        On a GPU, once ``work`` has run directly, this is a loop within a CUDA graph, launched asynchronously.
+        On a GPU, once ``work`` has run directly, the repetition is a loop within a CUDA graph, launched asynchronously.
         """
         return _WhileGraph(work, self, going)
 
@@ -166,8 +166,8 @@ class GraphStream:
     def pinned(self, count: int) -> torch.Tensor:
         """Return page-locked host memory (count,) of float64 zeros that a GPU can access directly.
 
-        Warp allocates it, because PyTorch records an event on the stream when it frees page-locked memory. If Warp's
-        stream has already been destroyed, this aborts the program at exit.
+        The memory is allocated by Warp and not by PyTorch. When PyTorch frees page-locked memory, it records an event
+        on the stream; if Warp's stream has already been destroyed at exit, this would abort the program.
         """
         return wp.to_torch(wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._stream is not None))
 

@@ -12,7 +12,8 @@ from scipy.sparse.csgraph import shortest_path
 _MAX_CUTS = 3
 """Maximum number of cuts, which divide the unknowns into one part more."""
 _MAX_SEQUENTIAL_FRACTION = 0.8
-"""Fraction of the unknowns eliminated in sequence above which a dissection saves less time than its launches cost."""
+"""Maximum fraction of the unknowns that are eliminated in sequence. Above it, a dissection saves less time than its
+launches cost."""
 
 
 @dataclass(frozen=True)

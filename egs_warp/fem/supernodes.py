@@ -89,7 +89,7 @@ class Supernodes:
 
 
 def first_of_equal_rows(full: sparse.csc_matrix) -> np.ndarray:
-    """Return (n,) bool, False for each row with the same pattern as the previous row, like the rows of one node.
+    """Return (n,) bool, False for each row with the same pattern as the previous row, for example the rows of one node.
 
     ``full`` is a symmetric matrix with both triangles and sorted indices.
     """

@@ -31,7 +31,7 @@ class TiledCholesky:
     """Dense Cholesky solver for symmetric matrices of one pattern; implements ``LinearSolver``.
 
     The inverse factor L^-1 is computed once per matrix, because a product with L^-1 takes a fiftieth of the time of a
-    triangular solve. The latter takes as long for one right-hand side as for a thousand.
+    triangular solve. A triangular solve takes as long for one right-hand side as for a thousand.
     """
 
     is_asynchronous = True
@@ -158,7 +158,9 @@ class TiledCholesky:
 
     @property
     def inverse(self) -> torch.Tensor:
-        """(n, n) matrix R on the device with S^-1 = R^T R: L^-1 with permuted unknowns. Its address never changes."""
+        """(n, n) matrix R on the device with S^-1 = R^T R: L^-1 with permuted unknowns. The address of R never
+        changes.
+        """
         return self._root.inverse
 
     def enqueue_solve(self, right: torch.Tensor) -> torch.Tensor:

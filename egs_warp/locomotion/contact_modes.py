@@ -311,7 +311,7 @@ class ModeRegion:
 
 def forces_in_modes(rows: np.ndarray, offset: np.ndarray, friction: float, modes: ContactModes) -> np.ndarray | None:
     """Return the contact forces (3n, m + 1) as an affine function of m other unknowns, with the constant in the last
-    column. They keep sticking contacts at rest and sliding contacts closed.
+    column. These forces keep sticking contacts at rest and sliding contacts closed.
 
     Args:
         rows: (3n, m + 3n) derivative of the contact velocities with respect to the m other unknowns and the forces.
@@ -397,8 +397,10 @@ def solve_mode_region(
 def _next_modes(
     program: CoulombProgram, modes: ContactModes, optimum: ModeRegionOptimum
 ) -> tuple[ContactModes, ContactModes | None]:
-    """Return the modes beyond all active constraints of ``optimum``, which lies in the region of ``modes``, and the
-    modes beyond its constraint with the largest multiplier alone; the second is None if only one is active."""
+    """Return two sets of modes: those beyond all active constraints of ``optimum``, which lies in the region of
+    ``modes``, and those beyond the constraint with the largest multiplier alone. The second is None if only one
+    constraint is active.
+    """
     neighbours = _NextModes(program, modes, optimum.x)
     constraints = optimum.contact, optimum.transition, optimum.multiplier
     after_all = neighbours.after_transitions(*constraints)

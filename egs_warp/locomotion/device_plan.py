@@ -41,8 +41,8 @@ from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.precision import Vec3, real
 
 PARALLEL_RESTART_COST = 0.5 * RESTART_COST
-"""If the objective value of a step is at least this, the next step runs its restart concurrently with the first search.
-"""
+"""If the objective value of a step is at least this, a restart runs concurrently with the first search of the next
+step."""
 
 
 class DevicePlanner:
@@ -193,7 +193,7 @@ class PlanWorkspace:
         """Start prediction and linear step, asynchronously; see ``DevicePlanner.start``."""
         body, newton, problem = self.body, self.newton, start.problem
         if body.predicted_start is not None:
-            # The upload for another plan may still be in flight.
+            # The upload for another plan may still be in flight, so its end is awaited.
             body.stream.wait()
         body.current = newton.base_iterate = newton.trial_iterate = newton.pending_iterate = None
         with body.stream:
@@ -318,7 +318,7 @@ class PlanWorkspace:
             self._plan_event.synchronize()
 
     def _run(self, work: Callable[..., None], *arguments: float) -> None:
-        """Run ``work`` as a CUDA graph, recorded for its name and arguments."""
+        """Run ``work`` as a CUDA graph, which is recorded under its name and its arguments."""
         self._graphs.run((work.__name__, *arguments), lambda: work(*arguments))
 
     def _upload_inputs(self, start: StepInputs, activations: np.ndarray) -> None:

@@ -94,7 +94,7 @@ class ModeSearchWorkspace:
     def search(
         self, program: CoulombProgram, start: np.ndarray, modes: ContactModes, qp_limit: int
     ) -> ModeSearchResult | None:
-        """Upload the QP, run the search, and return its result; arguments as for ``search_modes_device``."""
+        """Upload the QP, run the search, and return its result; arguments as in ``search_modes_device``."""
         m, n, at = program.activation_count, program.contact_count, kernels.HEADER_SIZE
         packed = self._host_input.numpy()
         packed[:at] = m, n, program.friction, program.constant, qp_limit, 0, 0, 0
@@ -268,7 +268,7 @@ class SearchPool:
         ]
 
     def run(self, packed: wp.array, *outputs: wp.array) -> None:
-        """Launch the kernel for the worlds of ``packed`` (B, ...); its ``outputs`` (B, ...) are written."""
+        """Launch the kernel for the worlds of ``packed`` (B, ...), and write its ``outputs`` (B, ...)."""
         lanes = 1 if self._device.is_cpu else WORLD_BLOCK
         for first in range(0, packed.shape[0], self._worlds):
             part = slice(first, min(first + self._worlds, packed.shape[0]))

@@ -185,7 +185,7 @@ class IslandStepper:
         return self._reports(problem, plans, result, clock)
 
     def _start(self, states: States, memories: Memories, dt: float) -> IslandInputs:
-        """Detect the contacts of a step and collect its inputs."""
+        """Detect the contacts of a step, and collect the inputs of the step."""
         problem = IslandProblem(
             tuple(
                 step_of(stepper.body, state, dt, stepper.settings.drag, drive)

@@ -70,14 +70,17 @@ class EnergyBalance:
     """(F,) energy lost by implicit Euler because it applies the elastic force at the end of the step throughout the
     step."""
     lost_muscle: np.ndarray
-    """(F,) energy lost in the same way by the muscles' forces."""
+    """(F,) energy lost by implicit Euler because it applies the muscles' forces at the end of the step throughout the
+    step."""
     lost_damping: np.ndarray
-    """(F,) energy lost in the same way by the damping forces."""
+    """(F,) energy lost by implicit Euler because it applies the damping forces at the end of the step throughout the
+    step."""
     spin_inside: np.ndarray
     """(F,) work of the torque that is removed from the internal forces within the step, to conserve the angular
     momentum."""
     spin_after: np.ndarray
-    """(F,) kinetic energy of the rotation that is added to the velocities after the step, for the same purpose."""
+    """(F,) kinetic energy of the rotation that is added to the velocities after the step, to conserve the angular
+    momentum."""
     muscle_work: np.ndarray
     """(F,) sum of max(0, T (L before - L after)): positive work of the muscles that shorten. It is not one of
     ``FLOWS``."""

@@ -135,7 +135,7 @@ def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Object
 
 def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarray, weight: float) -> Objective:
     """Return the objective that drives the mean stretch and shear rates of the body to the rates of the ``target``
-    velocities. It leaves finer deformations to elasticity, and translation and rotation to other objectives.
+    velocities. Finer deformations are left to elasticity, and translation and rotation to other objectives.
 
     The six rows are orthonormal in the mass-weighted mean, so the weight is comparable with the weight of
     ``node_velocities``.
@@ -265,7 +265,8 @@ def part_position(
     coordinates: Coordinates = WORLD,
 ) -> Objective:
     """Return the objective that moves the centre of ``part`` towards position ``target`` (3,) m in ``coordinates`` at
-    ``rate`` 1/s; a rate of 1/dt reaches it at the end of the step."""
+    ``rate`` 1/s. With a rate of 1/dt, the centre reaches the target at the end of the step.
+    """
     centre = part.centre(state.positions)
     if coordinates.relative:
         centre = centre - body.centre_of_mass(state.positions)
@@ -297,9 +298,9 @@ def part_angular_momentum(
     weight: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Return the objective that drives the angular momentum of ``part`` about its own centre to ``target`` (3,)
-    kg m^2/s. In relative coordinates, it is the angular momentum about the centre of mass of the body, with velocities
-    relative to it.
+    """Return the objective that drives the angular momentum of ``part`` about its own centre to ``target`` (3,) kg
+    m^2/s. In relative coordinates, the objective concerns the angular momentum about the centre of mass of the body,
+    with velocities relative to this centre.
 
     Rows are in m/s: angular momentum divided by mass x radius of gyration. For the whole body
     ``AngularMomentumObjective`` is exact, while this objective uses the lever arms at the start of the step.
@@ -326,9 +327,10 @@ def part_angular_velocity(
     weight: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Return the objective that drives the angular velocity of ``part`` to ``target`` (3,) rad/s. It is the angular
-    velocity of a rigid body with the angular momentum of the part. Rows are in m/s: angular velocity times radius of
-    gyration."""
+    """Return the objective that drives the angular velocity of ``part`` to ``target`` (3,) rad/s. The angular velocity
+    of a part is that of a rigid body with the same angular momentum. Rows are in m/s: angular velocity times radius of
+    gyration.
+    """
     momentum = part_angular_momentum(body, part, state, np.zeros(3), weight)
     unit = _gyration(part, state.positions) * part.masses.sum()
     radius = _gyration(part, state.positions)
@@ -361,7 +363,8 @@ def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, w
 
 def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float) -> Objective:
     """Return the objective that drives the velocities of the nodes of ``part`` to ``target`` (k, 3) m/s, with equal
-    weights. It controls position and shape of the part together."""
+    weights. This controls position and shape of the part together.
+    """
     count = len(part.nodes)
     columns = (3 * part.nodes[:, None] + np.arange(3)).ravel()
     share = np.sqrt(1.0 / count)

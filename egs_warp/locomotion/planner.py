@@ -162,7 +162,8 @@ class StepPlanner:
         activation = self._activation_cost(problem, predicted_velocities, previous, own.count)
         effort = effort_cost(problem, own, predicted_velocities.ravel(), effort_model)
         cost = finish_objectives() + effort + activation
-        # The objectives of a single body may be computed on a device, so its contact velocities come after them.
+        # The objectives of a single body may be computed on a device, so the contact velocities are computed after
+        # them.
         velocities = linear.contact_velocities(contacts) if velocities is None else velocities
         rows, offset = self._contact_rows(velocities, predicted)
         if others is not None:

@@ -112,8 +112,8 @@ def _displacements(body: SoftBody, state: BodyState) -> tuple[np.ndarray, float,
     """Return the displacement of the nodes from the captured shape.
 
     Returns:
-        (N, 3) m, displacement after the best-fit rigid motion, in axes of the captured shape; its maximum over the
-        nodes; and the maximum displacement including the rigid motion, both in body heights.
+        (N, 3) m, displacement after the best-fit rigid motion, in axes of the captured shape; the maximum length of
+        these displacements; and the maximum displacement including the rigid motion, both in body heights.
     """
     captured, end = body.mesh.nodes, state.positions
     rotation = body.best_fit_rotation(end)

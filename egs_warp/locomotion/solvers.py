@@ -69,7 +69,7 @@ class QuadraticProgram(Protocol):
     def solve(
         self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False
     ) -> QpSolution:
-        """Solve with these bounds.
+        """Solve the QP with the given bounds.
 
         Args:
             lower: (m,) lower bounds.

@@ -152,7 +152,7 @@ class EffortModel:
         )
         energy, gradient = assembly.energy_and_gradient(positions, damping)
         entries = factors.entries_from(assembly.enqueue_hessian(positions, damping, projected=True))
-        # This comes last, because a GPU factors asynchronously while the host continues.
+        # The factorisation is queued last, because a GPU factors asynchronously while the host continues.
         factors.factor(duration**2 * entries, np.repeat(body.node_mass, 3))
         return cls(positions, duration, energy, gradient.ravel(), entries, factors)
 

@@ -1,7 +1,7 @@
 """Audit of a world: residuals of the equations that couple its bodies (docs/concepts/bodies.md).
 
-They are computed from the trajectories of the bodies and, for gaps and penetration, from their contact points and level
-sets, without any code of the solver.
+The residuals are computed from the trajectories of the bodies and, for gaps and penetration, from their contact points
+and level sets, without any code of the solver.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ differently, so their times differ by rounding."""
 _MIN_SLOPE = 0.5
 """Lower bound of the slope of a level set in gaps (docs/concepts/bodies.md)."""
 _POINTS_AT_A_TIME = 256
-"""Number of points that are located in the tetrahedra of a body at once. It bounds the memory."""
+"""Number of points that are located in the tetrahedra of a body at once; it bounds the memory that this takes."""
 
 
 @dataclass(frozen=True)

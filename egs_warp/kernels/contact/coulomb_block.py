@@ -1,8 +1,8 @@
 """Block-cooperative routines of the Coulomb solve on a GPU: products, sweeps and residual (see
 ``kernels.contact.coulomb``).
 
-They compute the same sums as one thread on a CPU, in a different order, and are not called on a CPU. All ``BLOCK``
-threads of a block call each routine; afterwards, its results are visible to all of them.
+The routines compute the same sums as one thread on a CPU, in a different order, and are not called on a CPU. All
+``BLOCK`` threads of a block call each routine; afterwards, its results are visible to all of them.
 """
 
 import warp as wp

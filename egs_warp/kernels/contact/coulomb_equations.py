@@ -16,7 +16,8 @@ wp.set_module_options({"enable_backward": False})
 _ACROSS = wp.constant(32)
 """Number of threads that share a row of the equations."""
 _SINGULAR = wp.constant(real(1e-14))
-"""Relative pivot threshold. An unknown stays zero if its pivot is not above this fraction of the largest so far."""
+"""Relative pivot threshold. An unknown stays zero if its pivot is not larger than this fraction of the largest pivot so
+far."""
 
 
 @wp.struct

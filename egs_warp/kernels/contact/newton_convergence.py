@@ -88,8 +88,8 @@ def begin_loop_kernel(
     Clear the outcome, replace an unknown residual by that of the last trial, and set the condition of the loop.
 
     Args:
-        enabled: (1,) 0 to skip the loop.
-        sizes: (c,) residuals of the last trials, in the ``UNIT`` of the row.
+        enabled: (c,) 0 to skip the loop.
+        sizes: (c,) residual norms of the last trials, before the division by the ``UNIT`` of the row.
         progress: (c, ``ROW_SIZE``) progress, updated.
         running_out: (c,) condition of the loop, ``enabled``.
     """
@@ -182,7 +182,7 @@ def judge_steps_kernel(
 
     Args:
         failure_tolerance: violation in m/s above which the Coulomb solve has failed numerically.
-        sizes: (c,) residuals of the trials, in the ``UNIT`` of the row.
+        sizes: (c,) residual norms of the trials, before the division by the ``UNIT`` of the row.
         violations: (c,) m/s, violations of Coulomb's law by the forces of the trials.
         penetrating: (c,) number of points that penetrate too far.
         progress: (c, ``ROW_SIZE``) progress, updated.

@@ -29,8 +29,8 @@ def occlude_kernel(
     # Out:
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Darken each Gaussian near the occluding body: multiply its colour by 1 - a with a = ``max_opacity`` exp(-gap /
-    reach) (1 - n_z) / 2.
+    """Darken each Gaussian near the occluding body: multiply its colour by 1 - a with a = ``max_opacity`` exp(-max(gap,
+    0) / reach) (1 - n_z) / 2.
 
     The gap and the outward normal n are those of the occluding body at the mean of the Gaussian. (1 - n_z) / 2 is the
     fraction of the sky that a plane with this normal hides. Gaussians outside the box from ``low`` to ``high`` do not

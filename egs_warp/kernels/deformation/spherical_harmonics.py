@@ -2,8 +2,8 @@
 
 A rotation is decomposed into rotations about z, y and z. A rotation about y equals a rotation about z between quarter
 turns about x. A rotation about z rotates the coefficients of orders m and -m as a pair, and a quarter turn about x
-mixes only a few coefficients (Pinchon and Hoggan 2007). This takes half the work of a full matrix for each band, and no
-matrix is formed.
+mixes only a few coefficients (Pinchon and Hoggan 2007). The decomposition takes half the work of a full matrix for each
+band, and no matrix is formed.
 """
 
 import numpy as np

@@ -18,7 +18,7 @@ _MIN_IRRADIANCE = wp.constant(wp.float32(0.2))
 """Minimum irradiance, relative to its mean; the quadratic form is slightly negative on the side opposite to a single
 light."""
 _MAX_RATIO = wp.constant(wp.float32(2.5))
-"""Maximum ratio of two irradiances. A captured colour near black or white cannot be scaled by more."""
+"""Maximum ratio of two irradiances, because a captured colour near black or white cannot be scaled by more."""
 
 
 @wp.func

@@ -17,7 +17,7 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 FREE, STICK, SLIDE = 0, 1, 2
-"""Contact modes."""
+"""Contact modes, as values of ``Workspace.kinds``."""
 TO_FREE, TO_SLIDE, TO_OTHER_DIRECTION, TO_TOUCHING = 0, 1, 2, 3
 """Mode transitions. A contact makes one when a row that bounds the region becomes active."""
 CONE_FACES = 8

@@ -57,7 +57,7 @@ class Relaxed:
     root: wp.array2d[real]
     """(N, N) upper triangular U with Hessian^-1 = U U^T."""
     leaving: wp.array2d[real]
-    """(n, N) rows of the normal contact velocities."""
+    """(n, N) rows that give the normal contact velocities."""
     minimum: wp.array[real]
     """(N,) unconstrained minimum."""
     optimum: wp.array[real]

@@ -1,4 +1,6 @@
-"""Kernels of support polygons: convex hulls and nearest points; one thread for each world."""
+"""Kernels of support polygons: convex hulls, and points in them that are nearest to given points; one thread
+per world.
+"""
 
 import warp as wp
 

@@ -57,7 +57,7 @@ def tone_kernel(
         tone: (12,) colour transform of the photo's exposure.
         colour, alpha: the render.
         image, image_alpha: the photo.
-        weight: weight of each pixel, or one weight for all.
+        weight: weight of each pixel; an array of length 1 stands for weights of 1.
         toned_out, photo_out: the transformed render and the photo, padded.
         front_out: the render before the colour transform, without the backdrop.
         off_out: weighted mean absolute difference of the channels.
