@@ -161,7 +161,7 @@ class CoupledSolver(NewtonOptions):
 
 
 _WORLD = (0,)
-"""The set that contains the only world, which has the index 0."""
+"""Set that contains the only world, which has the index 0."""
 
 
 class _OneRound:

@@ -30,7 +30,7 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy
 
 _CAPACITY_STEP = 8
-"""Contact capacities are multiples of this. Each capacity has separate buffers and graphs."""
+"""Multiple to which contact capacities are rounded up. Each capacity has separate buffers and graphs."""
 
 
 class DeviceContactLinearizer(StepWorkspace, ContactLinearizer):

@@ -29,7 +29,7 @@ from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.precision import Mat33, Vec3
 
 _CAPACITY_STEP = 64
-"""Capacities for rank-one terms of the muscles' stiffness are multiples of this."""
+"""Multiple to which capacities for rank-one terms of the muscles' stiffness are rounded up."""
 _SIGNS = (1.0, -1.0)
 """Signs of the low-rank updates; the update with the negative sign is applied last."""
 

@@ -237,7 +237,7 @@ class NewtonStepResult:
     forces: np.ndarray
     """(n, 3) newtons, contact forces of the last step."""
     coulomb_violation: float
-    """Violation of Coulomb's law by these forces, m/s."""
+    """Violation of Coulomb's law by ``forces``, m/s."""
     trial: NewtonIterate
     """Iterate at the end of the last step."""
 

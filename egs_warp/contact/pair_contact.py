@@ -77,7 +77,8 @@ class PairContactDetector:
 
     def numbers(self, body: int | np.ndarray, points: np.ndarray, other: int | np.ndarray) -> np.ndarray:
         """Return the numbers (n,) of the contacts of ``points`` (n,) of ``body`` with the body ``other``, or with the
-        ground if it is -1; bodies can be arrays (n,)."""
+        ground if ``other`` is -1. ``body`` and ``other`` may also be arrays (n,).
+        """
         return (other + 1) * self.point_starts[-1] + self.point_starts[body] + points
 
     def keys(self, numbers: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from egs_warp.launching import round_up
 from egs_warp.precision import Mat33, Vec4, real
 
 _CAPACITY_STEP = 64
-"""Capacities for points of the previous step are multiples of this."""
+"""Multiple to which capacities for points of the previous step are rounded up."""
 _RECORD_SIZE = 17
 """Size of a contact's record in float64 values: 9 for the axes, 4 for the weights, 1 for the gap, and 3 that hold two
 int32 each, for 4 nodes, the face and the point.

@@ -10,7 +10,7 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import shortest_path
 
 _MAX_CUTS = 3
-"""Maximum number of cuts, which divide the unknowns into one part more."""
+"""Maximum number of cuts. With n cuts, the unknowns are divided into n + 1 parts."""
 _MAX_SEQUENTIAL_FRACTION = 0.8
 """Maximum fraction of the unknowns that are eliminated in sequence. Above it, a dissection saves less time than its
 launches cost."""
@@ -27,7 +27,7 @@ class Dissection:
     parts: list[np.ndarray]
     """Unknowns of each part, ascending."""
     separator: np.ndarray
-    """All other unknowns, ascending."""
+    """Unknowns that are in no part, ascending."""
 
     @property
     def order(self) -> np.ndarray:

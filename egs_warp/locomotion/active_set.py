@@ -20,7 +20,7 @@ from egs_warp.launching import launch_cached, round_up, thread_local_cache
 
 (_trtri,) = get_lapack_funcs(("trtri",), dtype=np.float64)
 _ROW_STEP = 32
-"""The row capacity of a workspace is a multiple of this."""
+"""Multiple to which the row capacity of a workspace is rounded up."""
 _BOUND_TOLERANCE = 1e-8
 """Tolerance of the bounds of a row, multiplied by the row's norm in z if that exceeds 1."""
 _INFEASIBLE_COST = 1e6
@@ -30,7 +30,7 @@ infeasible."""
 
 @dataclass(frozen=True)
 class WhitenedQp:
-    """The QP min 1/2 x^T P x + q^T x with constraint rows A, in whitened coordinates.
+    """QP min 1/2 x^T P x + q^T x with constraint rows A, in whitened coordinates.
 
     The coordinates are z = U^-1 (x - x0), with the unconstrained minimum x0 and P^-1 = U U^T. In z, the Hessian is the
     identity, and the objective is 1/2 |z|^2 plus its value at x0.

@@ -120,7 +120,7 @@ class ModeRegionOptimum:
     transition: np.ndarray
     """(k,) transition that the contact makes beyond the constraint, as in ``ModeRegion``."""
     multiplier: np.ndarray
-    """(k,) multiplier of the constraint, positive."""
+    """(k,) multiplier of the constraint, which is positive."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +258,7 @@ class ModeRegion:
     rows: np.ndarray
     """(m + k, m): m rows of the activations themselves, then k mode constraints."""
     rows_offset: np.ndarray
-    """(m + k,) values of these rows at a = 0."""
+    """(m + k,) values of ``rows`` at a = 0."""
     contact: np.ndarray
     """(k,) contact of each mode constraint."""
     transitions: np.ndarray

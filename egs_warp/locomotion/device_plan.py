@@ -1,8 +1,7 @@
-"""The plan of a step on a GPU: prediction, QP, search and start of the solve, with one read-back (Eq. 4, 7, 8, 9, 12,
-13).
+"""Plan of a step on a GPU: prediction, QP, search and start of the solve, with one read-back (Eq. 4, 7, 8, 9, 12, 13).
 
-In the nominal case it does the work of ``LocomotionStepper.predict`` and ``StepPlanner.plan``, as CUDA graphs of
-PyTorch and Warp operations. In other cases it returns None, and the host plans the step. Its kernels are in
+In the nominal case the device planner does the work of ``LocomotionStepper.predict`` and ``StepPlanner.plan``, as CUDA
+graphs of PyTorch and Warp operations. In other cases it returns None, and the host plans the step. The kernels are in
 ``egs_warp.kernels.locomotion.step_program``, ``mode_search`` and ``relaxed_contact``.
 """
 
@@ -41,8 +40,7 @@ from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.precision import Vec3, real
 
 PARALLEL_RESTART_COST = 0.5 * RESTART_COST
-"""If the objective value of a step is at least this, a restart runs concurrently with the first search of the next
-step."""
+"""Objective value of a step from which on a restart runs concurrently with the first search of the next step."""
 
 
 class DevicePlanner:

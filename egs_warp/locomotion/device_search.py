@@ -1,6 +1,6 @@
-"""The mode search of a step on a GPU, in one launch and one read-back.
+"""Mode search of a step on a GPU, in one launch and one read-back.
 
-Its kernels are in ``egs_warp.kernels.locomotion.mode_search`` and ``egs_warp.kernels.locomotion.relaxed_contact``.
+The kernels are in ``egs_warp.kernels.locomotion.mode_search`` and ``egs_warp.kernels.locomotion.relaxed_contact``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from egs_warp.locomotion.contact_modes import ContactModes, CoulombProgram, Mode
 from egs_warp.precision import real
 
 CAPACITY_MULTIPLE = 8
-"""Contact capacities are multiples of this."""
+"""Multiple to which contact capacities are rounded up."""
 WORLD_BLOCK = 128
 """Number of threads in the block of each world on a GPU. It is smaller than that of a single world, so that several
 blocks share a multiprocessor."""

@@ -39,7 +39,7 @@ class EnergyBalance:
     """Energy balance in J of F+1 states and F steps. Terms that take energy from the body are negative."""
 
     energy_unit: float
-    """m g H."""
+    """m g H in joules, the unit of ``residual``."""
     kinetic_com: np.ndarray
     """(F+1,) kinetic energy of the motion of the centre of mass."""
     kinetic_rotation: np.ndarray

@@ -191,7 +191,7 @@ _LINEAR_MODES, _MIN_MODE = _linear_modes(), 1e-6
 
 @dataclass(frozen=True)
 class BodyPart:
-    """The whole body or a part of it (a foot, the head, the base): nodes and their masses."""
+    """Part of the body (a foot, the head, the base) or the whole body: nodes and their masses."""
 
     name: str
     nodes: np.ndarray

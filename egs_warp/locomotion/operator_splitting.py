@@ -27,7 +27,7 @@ RHO = 1.0
 _WARM_START_ACCURACY = 1e-3
 """Accuracy at which a warm start may end before its last iteration."""
 _ROW_MULTIPLE = 8
-"""The row capacity of warm starts is a multiple of this."""
+"""Multiple to which the row capacity of warm starts is rounded up."""
 _CODES: Any = osqp.SolverStatus
 
 

@@ -1,4 +1,4 @@
-"""The paper's search for the contact states of a step: the QP in the predicted states, then pivoting (Eq. 12, 13).
+"""Search of the paper for the contact states of a step: the QP in the predicted states, then pivoting (Eq. 12, 13).
 
 See docs/concepts/locomotion.md#contact-states.
 """

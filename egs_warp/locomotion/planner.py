@@ -1,5 +1,6 @@
-"""The plan of a step: assemble the QP about the predicted end, search for the best contact modes, and compute the
-expected end of the step (Eq. 13)."""
+"""Plan of a step: assemble the QP about the predicted end, search for the best contact modes, and compute the expected
+end of the step (Eq. 13).
+"""
 
 from __future__ import annotations
 

@@ -86,14 +86,14 @@ class AffineObjectives(BatchedRecord):
 
 @dataclass(frozen=True)
 class ReducedObjectives(BatchedRecord):
-    """Objectives of a step: on the end velocity and on the angular momentum."""
+    """Objectives of a step, on the end velocity and on the angular momentum."""
 
     affine: AffineObjectives
     """Objectives on the end velocity."""
     momentum: Any
     """(..., 3) kg m^2/s, target of the angular momentum (``AngularMomentumObjective``)."""
     momentum_weight: Any
-    """(...,) its weight."""
+    """(...,) weight of the objective on the angular momentum."""
 
     def of_one_world(self, shares: np.ndarray, positions: np.ndarray) -> list[AnyObjective]:
         """Return the objectives of a record of one world. Objectives on the end velocity with zero weight are left out,

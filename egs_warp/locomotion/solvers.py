@@ -21,7 +21,7 @@ _MAX_ITERATIONS = 4000
 _BOUND_PADDING = 0.3
 """Distance by which bounds are widened, in units of the accuracy."""
 _EQUALITY_WIDTH = 1e-12
-"""A row whose bounds are closer than this is an equality."""
+"""Distance between the bounds of a row below which the row is treated as an equality."""
 
 
 class QpSolver(Enum):
@@ -36,7 +36,7 @@ class QpSolver(Enum):
 
     @property
     def on_host(self) -> QpSolver:
-        """The solver of single QPs on the host: OSQP in place of ``admm``."""
+        """Solver of single QPs on the host: OSQP in place of ``admm``."""
         return QpSolver.OSQP if self is QpSolver.ADMM else self
 
     @classmethod
@@ -64,7 +64,9 @@ class QpSolution:
 
 
 class QuadraticProgram(Protocol):
-    """The QP min 1/2 x^T P x + q^T x subject to lower <= A x <= upper, set up once; a solve changes only the bounds."""
+    """QP min 1/2 x^T P x + q^T x subject to lower <= A x <= upper, which is set up once; a solve changes only the
+    bounds.
+    """
 
     def solve(
         self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False

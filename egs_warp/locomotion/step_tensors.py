@@ -66,9 +66,9 @@ class WeightedRows(BatchedRecord):
     indices: torch.Tensor
     """(..., S) int64, column of the entry of each row with one entry."""
     entries: torch.Tensor
-    """(..., S) these entries."""
+    """(..., S) entries of the rows with one entry."""
     entry_targets: torch.Tensor
-    """(..., S) m/s, targets of these rows."""
+    """(..., S) m/s, targets of the rows with one entry."""
     rows: torch.Tensor
     """(..., R, 3N) dense rows."""
     targets: torch.Tensor

@@ -1,4 +1,4 @@
-"""The stepper: predict the end of a step, plan the activations, solve motion and contact together (Eq. 4, 9, 12, 13).
+"""Stepper: predict the end of a step, plan the activations, solve motion and contact together (Eq. 4, 9, 12, 13).
 
 ``LocomotionStepper.step`` makes one step; ``LocomotionStepper.advance`` also repeats a step that does not converge. The
 stages are in ``contact.selection`` (contact points), ``linear_step`` and ``planner`` (plan) and
@@ -40,8 +40,8 @@ from egs_warp.short_repr import short_repr
 MAX_HALVINGS = 4
 """Maximum number of successive halvings of a step that does not converge."""
 REPLAN_FACTOR, REPLAN_MARGIN = 1.2, 0.01
-"""A step is replanned if its objectives cost more than the first value times the cost that the plan expects, plus the
-second value."""
+"""Factor and margin of a replan: a step is replanned if its objectives cost more than the first value times the cost
+that the plan expects, plus the second value."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from egs_warp.locomotion.paper_strategy import search_states
 from egs_warp.locomotion.solvers import QpSolver
 
 RESTART_GAP = 1.2
-"""A mode search restarts from the relaxed optimum if its objective exceeds this factor times the relaxed objective."""
+"""Factor of the relaxed objective above which a mode search restarts from the relaxed optimum."""
 RESTART_COST = 0.3
 """Minimum objective for which a mode search restarts."""
 

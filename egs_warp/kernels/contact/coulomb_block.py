@@ -20,7 +20,7 @@ SHARED_MEMORY_DOUBLES = 5264
 """Size of the shared memory of a block, in doubles. The routines use it one after the other."""
 
 _RECIPROCALS = """
-    // Reciprocal and reciprocal root to rounding, for normal numbers only.
+    // Reciprocal and reciprocal square root up to rounding, for normal numbers only.
     auto over = [](double value) {
         double by;
         asm("rcp.approx.ftz.f64 %0, %1;" : "=d"(by) : "d"(value));

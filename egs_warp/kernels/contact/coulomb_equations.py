@@ -73,7 +73,7 @@ class Pivots:
     panel_count: int
     """Number of pivots in the last panel."""
     parts: wp.vec4i
-    """Columns of these pivots within the panel."""
+    """Columns of the pivots in the last panel, within the panel."""
 
 
 @wp.func
@@ -243,7 +243,7 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, reg
 @wp.func_native("""
     int best = rank;
 #if defined(__CUDA_ARCH__)
-    // Compared in single precision, which is enough for a pivot. Bits of positive floats sort like their values.
+    // Entries are compared in single precision, which is enough for a pivot. Positive floats sort like their bits.
     __shared__ unsigned int sizes[32];
     __shared__ int rows[32];
     const double* const M = (const double*)matrix.data;
@@ -381,7 +381,7 @@ def eliminate(unknowns: int, newton: Newton):
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    // Two slots in turn, so that none is overwritten before all threads have read it.
+    // Two slots are used in turn, so that none is overwritten before all threads have read it.
     __shared__ double solved[2];
     double* const M = (double*)matrix.data;
     const int stride = matrix.strides[0] / 8;

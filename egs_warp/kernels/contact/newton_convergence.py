@@ -1,4 +1,4 @@
-"""The rule that accepts and shortens Newton steps on motion and contact, in any number of worlds (Eq. 4, 8)."""
+"""Rule that accepts, shortens and ends Newton steps on motion and contact, in any number of worlds (Eq. 4, 8)."""
 
 import warp as wp
 
@@ -7,9 +7,8 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 REFACTOR_RATIO = 0.7
-"""The tangent is updated if a step leaves more than this fraction of the residual. The first step of a round is exempt,
-because it creates the forces of new contacts. Computing a new tangent takes as long as many steps.
-"""
+"""Fraction of the residual that a step may leave without an update of the tangent. The first step of a round is exempt,
+because it creates the forces of new contacts. Computing a new tangent takes as long as many steps."""
 MIN_DECREASE = 1e-4
 """Sufficient decrease of a full step, as a fraction of the largest recent residual."""
 RESIDUAL_WINDOW = 3

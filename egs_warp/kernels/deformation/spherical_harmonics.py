@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 Mat53 = wp.types.matrix(shape=(5, 3), dtype=wp.float32)
 Mat73 = wp.types.matrix(shape=(7, 3), dtype=wp.float32)
 Colour = wp.types.matrix(shape=(16, 3), dtype=wp.float32)
-"""All coefficients of degree 3, one row each."""
+"""Type of the coefficients of degree 3, one row each."""
 
 TINY = wp.constant(wp.float32(1.0e-18))
 S34 = wp.constant(wp.float32(np.sqrt(3 / 4)))

@@ -102,7 +102,7 @@ class MuscleSegments:
     nodes: wp.array[wp.int32]
     """Nodes of each segment, segment by segment."""
     weights: wp.array[real]
-    """Weights of these nodes. The segment vector is the weighted sum of their positions."""
+    """Weights of ``nodes``. The segment vector is the weighted sum of the positions of its nodes."""
     rest_lengths: wp.array[real]
     """(M,) m, rest lengths."""
     tensions: wp.array[real]

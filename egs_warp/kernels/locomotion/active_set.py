@@ -29,13 +29,14 @@ OPTIMUM_FOUND, INFEASIBLE, NUMERICAL_FAILURE = wp.constant(0), wp.constant(1), w
 """Status of a solve: optimum found, no point satisfies the bounds, or numerical failure."""
 
 WRONG_SIGN_TOLERANCE = wp.constant(real(1e-9))
-"""A multiplier has the wrong sign if it is below minus this fraction of the largest multiplier."""
+"""Tolerance of multipliers, as a fraction of the largest one. Below minus this tolerance, a multiplier has the wrong
+sign."""
 REDUNDANCY_TOLERANCE = wp.constant(real(1e-12))
 """Shift of the diagonal of the Gram matrix of the active rows, which is singular if rows are redundant."""
 BOUND_TOLERANCE = wp.constant(real(1e-7))
 """Maximum distance of an active row from its bound. A row that depends on other active rows can be further away."""
 DEPENDENCE_TOLERANCE = wp.constant(real(1e-9))
-"""A row depends on the active rows if its part orthogonal to them has a smaller squared length than this."""
+"""Squared length of a row's part orthogonal to the active rows, below which the row depends on them."""
 PIVOTS = wp.constant(600)
 """Maximum number of dual iterations."""
 RESTARTS = wp.constant(8)
@@ -59,7 +60,7 @@ class UnitConstraints:
     base_rows: wp.array2d[int]
     """(m, 3) indices of the base rows of each row of R."""
     coefficients: wp.array2d[real]
-    """(m, 3) coefficients of these base rows."""
+    """(m, 3) coefficients of the base rows in each row of R."""
     base_values: wp.array[real]
     """(k,) scratch memory for the values of the base rows at a point."""
     values_at_origin: wp.array[real]

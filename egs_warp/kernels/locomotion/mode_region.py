@@ -93,7 +93,7 @@ class Workspace:
     base_rows: wp.array2d[int]
     """(k, 3) indices of the three terms of each mode row among the T forces and v velocities."""
     coefficients: wp.array2d[real]
-    """(k, 3) coefficients of these terms."""
+    """(k, 3) coefficients of the three terms of each mode row."""
     contact: wp.array[int]
     """(k,) contact of each mode row."""
     transition: wp.array[int]
@@ -142,7 +142,7 @@ class Workspace:
     active bounds; ``NEXT_SINGLE``, the region beyond its strongest active bound only; ``WARM_START``, the
     ``NEXT_SINGLE`` of the best region so far."""
     slips: wp.array3d[real]
-    """(4, n, 2) slip directions in the same slots."""
+    """(4, n, 2) slip directions in the four slots of ``kinds``."""
     start: wp.array[real]
     """(m,) activations at which the search enters the region."""
     trial: wp.array[real]

@@ -19,7 +19,8 @@ LOG_255 = wp.constant(wp.float32(-math.log(_ALPHA_CUT)))
 ALPHA_LIMIT = wp.constant(wp.float32(_ALPHA_LIMIT))
 """Maximum alpha of one splat; where alpha reaches it, the gradient is zero."""
 TRANSMITTANCE_STOP = wp.constant(wp.float32(_TRANSMITTANCE_STOP))
-"""A splat that would reduce the transmittance to this value or less is not blended, nor are the splats behind it."""
+"""Minimum transmittance. A splat that would reduce the transmittance to this value or less is not blended, nor are the
+splats behind it."""
 TILE = wp.constant(16)
 """Side of a square tile in pixels."""
 TILE_PIXELS = wp.constant(256)
@@ -31,7 +32,7 @@ CUTOFFS_IN_CPP = f"""
     constexpr float LIMIT = {_ALPHA_LIMIT}f;
     constexpr float STOP = {_TRANSMITTANCE_STOP}f;
 """
-"""The same constants in C++, for compositing."""
+"""C++ definitions of these constants, for compositing."""
 
 
 @wp.func
