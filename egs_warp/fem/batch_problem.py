@@ -194,7 +194,7 @@ class BatchProblem(ImplicitStep[torch.Tensor]):
         The fallback matrices are the same as in ``StepProblem.tangent``.
 
         Args:
-            velocities: (c, N, 3) m/s, linearization point.
+            velocities: (c, N, 3) m/s, linearisation point.
             tensions: (c, M) N, muscle tensions, or None.
 
         Returns:

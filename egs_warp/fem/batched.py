@@ -127,7 +127,7 @@ def _count(value: BatchedRecord | torch.Tensor) -> int:
 
 
 def nonzero(mask: torch.Tensor) -> torch.Tensor:
-    """Return the indices (k,) int64 at which ``mask`` (c,) is true; synchronizes with the device."""
+    """Return the indices (k,) int64 at which ``mask`` (c,) is true; synchronises with the device."""
     return mask.nonzero().squeeze(1)
 
 
@@ -137,7 +137,7 @@ def array_module(values: Array) -> ModuleType:
 
 
 def empty_like(values: ArrayT, shape: tuple[int, ...]) -> ArrayT:
-    """Return an uninitialized array of ``shape``, of the kind, type and device of ``values``."""
+    """Return an uninitialised array of ``shape``, of the kind, type and device of ``values``."""
     return np.empty(shape, values.dtype) if isinstance(values, np.ndarray) else values.new_empty(shape)
 
 

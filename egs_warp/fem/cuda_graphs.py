@@ -31,7 +31,7 @@ _entered = _Entered()
 
 
 class GraphStream:
-    """Stream that PyTorch and Warp share. On a GPU it is Warp's stream, so that the two need no synchronization."""
+    """Stream that PyTorch and Warp share. On a GPU it is Warp's stream, so that the two need no synchronisation."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -104,7 +104,7 @@ class GraphStream:
         """Return a function that runs ``work``, on a GPU as a CUDA graph.
 
         The first call runs ``work`` directly, so that compilation and setup are done before the second call captures
-        it. ``work`` must not synchronize with the device.
+        it. ``work`` must not synchronise with the device.
         """
         return work if self._stream is None else _Graph(work, self)
 
@@ -121,7 +121,7 @@ class GraphStream:
         All graphs share one pool of temporary memory, because they run sequentially and leave no results in it. The
         first graph is retained, since the pool is released with its last graph. No other thread may use the device
         during a capture, as its operations would be captured too. Python's garbage collection is disabled during a
-        capture, since freeing device memory would synchronize with the device.
+        capture, since freeing device memory would synchronise with the device.
 
         Args:
             work: operations to capture.
@@ -280,7 +280,7 @@ class _WhileGraph:
 
 
 def _repeat(work: Callable[[], None], going: torch.Tensor) -> int:
-    """Run ``work`` while ``going`` is not 0, with a synchronization each time, and return the number of runs."""
+    """Run ``work`` while ``going`` is not 0, with a synchronisation each time, and return the number of runs."""
     count = 0
     while int(going) != 0:
         work()

@@ -39,7 +39,7 @@ class Dissection:
         """Dissect a matrix whose pattern has the upper triangle ``upper``.
 
         The candidates for cuts are the levels of a breadth-first search from one end of the graph. The chosen cuts
-        minimize the number of unknowns in the largest part plus the number of unknowns in all cuts.
+        minimise the number of unknowns in the largest part plus the number of unknowns in all cuts.
         """
         count = len(upper.indptr) - 1
         whole = cls([np.arange(count)], np.zeros(0, int))

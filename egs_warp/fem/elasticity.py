@@ -49,7 +49,7 @@ class ElasticAssembly:
 
     @cached_property
     def analysis(self) -> SymbolicFactorization:
-        """Symbolic factorization of ``upper_pattern``."""
+        """Symbolic factorisation of ``upper_pattern``."""
         return SymbolicFactorization.of(self.upper_pattern)
 
     def new_solver(self) -> LinearSolver:

@@ -1,4 +1,4 @@
-"""Memory layout of the multifrontal factorization."""
+"""Memory layout of the multifrontal factorisation."""
 
 from __future__ import annotations
 

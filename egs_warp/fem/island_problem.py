@@ -97,7 +97,7 @@ class IslandProblem:
 
         Args:
             factors: solver of each body.
-            velocities: (N, 3) m/s, linearization point.
+            velocities: (N, 3) m/s, linearisation point.
             tensions: muscles of each body.
         """
         parts = zip(self.problems, factors, self.split(velocities), self._each(tensions), strict=True)

@@ -1,4 +1,4 @@
-"""Multifrontal L D L^T factorization of a step's sparse matrix, with solves for many right-hand sides.
+"""Multifrontal L D L^T factorisation of a step's sparse matrix, with solves for many right-hand sides.
 
 The kernels are in ``egs_warp.kernels.fem.supernodal``, ``quadratic_form`` and ``products``.
 """
@@ -30,7 +30,7 @@ _MIN_RELATIVE_PIVOT = 1e-14
 
 @dataclass(frozen=True)
 class SymbolicFactorization:
-    """Symbolic factorization of a sparsity pattern, shared by all matrices with that pattern."""
+    """Symbolic factorisation of a sparsity pattern, shared by all matrices with that pattern."""
 
     full_from_upper: np.ndarray
     """(nnz of the full matrix,) index of the upper entry that equals each entry of the full symmetric matrix, in column
@@ -83,7 +83,7 @@ class MultifrontalLdl:
 
         Args:
             upper_pattern: (n, n) upper triangle with the diagonal, entries in the order of ``factor``.
-            analysis: symbolic factorization of the pattern; computed if None.
+            analysis: symbolic factorisation of the pattern; computed if None.
         """
         self._device = wp.get_device("cpu")
         # Loading a module from two threads at once is not safe.
@@ -339,7 +339,7 @@ def _shared_zeros(size: int | tuple[int, ...]) -> tuple[np.ndarray, wp.array]:
 def inverse_and_positives(symmetric: np.ndarray) -> tuple[int, np.ndarray]:
     """Return the number of positive eigenvalues and the inverse of a symmetric matrix.
 
-    Both come from one Bunch-Kaufman factorization. Of ``symmetric`` (n, n) only the lower triangle is read. For a
+    Both come from one Bunch-Kaufman factorisation. Of ``symmetric`` (n, n) only the lower triangle is read. For a
     singular matrix the number is -1 and the inverse is not finite.
     """
     factor, invert = dense.get_lapack_funcs(("sytrf", "sytri"), (symmetric,))

@@ -96,7 +96,7 @@ class StepProblem(ImplicitStep):
 
         Args:
             factors: solver that holds the factors.
-            velocities: (N, 3) m/s, linearization point.
+            velocities: (N, 3) m/s, linearisation point.
             tension: muscle energy, or None.
 
         Returns:
@@ -150,7 +150,7 @@ class Tangent:
     factors: LinearSolver
     """Factors of S + dt^2 K_a."""
     pending_velocities: np.ndarray | None = None
-    """(N, 3) m/s, linearization point of factors that are only queued; None if the factors are computed."""
+    """(N, 3) m/s, linearisation point of factors that are only queued; None if the factors are computed."""
 
     def wait(self) -> bool:
         """Block until queued factors are computed. If S is not positive definite, factor an approximation instead.

@@ -91,7 +91,7 @@ class TiledCholesky:
             self._diagonal.copy_(self._to_device(diagonal))
 
     def enqueue_factor(self, entries: torch.Tensor) -> None:
-        """Queue the factorization with the uploaded diagonal, as part of a graph.
+        """Queue the factorisation with the uploaded diagonal, as part of a graph.
 
         After launching the graph, the caller must call ``mark_started``.
         """
@@ -115,7 +115,7 @@ class TiledCholesky:
         self._pending = True
 
     def _factor(self) -> None:
-        """Queue the factorization with the current entries and diagonal, and the download of its ``verdict``."""
+        """Queue the factorisation with the current entries and diagonal, and the download of its ``verdict``."""
         self._root.matrix.view(-1)[self.places] = self._entries
         self._root.matrix.diagonal().add_(self._diagonal[self._root.order])
         definite = self._root.factor()
@@ -239,7 +239,7 @@ class TiledCholesky:
         dt_ahead: float,
         reference: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Queue ``quadratic_form`` of device tensors, without synchronization."""
+        """Queue ``quadratic_form`` of device tensors, without synchronisation."""
         flat = self._energy_hessian.view(-1)
         flat[self._upper] = entries
         flat[self._lower] = entries

@@ -5,7 +5,7 @@ vector types and the fused multiply-adds to instructions of the processor.
 """
 
 BLOCK = 16
-"""Number of columns that are eliminated at once. The factorization stores the inverse of each diagonal block of this
+"""Number of columns that are eliminated at once. The factorisation stores the inverse of each diagonal block of this
 size."""
 
 _PRODUCTS = """

@@ -191,7 +191,7 @@ class PlanWorkspace:
         """Start prediction and linear step, asynchronously; see ``DevicePlanner.start``."""
         body, newton, problem = self.body, self.newton, start.problem
         if body.predicted_start is not None:
-            # The upload for another plan may still be in flight, so its end is awaited.
+            # The upload for another plan may still be in flight, so block until it is done.
             body.stream.wait()
         body.current = newton.base_iterate = newton.trial_iterate = newton.pending_iterate = None
         with body.stream:

@@ -17,7 +17,7 @@ BLOCK = 256
 
 @wp.func
 def block_sum(value: Vec3):
-    """Return the sum of ``value`` over the threads of the block; synchronizes the block."""
+    """Return the sum of ``value`` over the threads of the block; synchronises the block."""
     first = sum_of_block(value[0])
     sync_block()
     second = sum_of_block(value[1])

@@ -1,4 +1,4 @@
-"""Multifrontal L D L^T factorization of a sparse symmetric matrix, and solves with its factors, in vectors of four
+"""Multifrontal L D L^T factorisation of a sparse symmetric matrix, and solves with its factors, in vectors of four
 numbers on a CPU.
 
 The host code is in ``egs_warp.fem.multifrontal``.
@@ -123,13 +123,13 @@ def factor_native(
     inverses: wp.array[real],
     reciprocals: wp.array[real],
 ) -> wp.int32:
-    """Compute the L D L^T factorization of a sparse symmetric matrix.
+    """Compute the L D L^T factorisation of a sparse symmetric matrix.
 
     Args:
         fronts: the supernodes.
         count: number of supernodes S.
         matrix: (nnz,) upper entries.
-        min_pivot: a pivot of this magnitude or smaller stops the factorization.
+        min_pivot: a pivot of this magnitude or smaller stops the factorisation.
         front: workspace for the largest front and, behind it, scratch memory.
         front_size: size of the largest front, in numbers.
         stack: workspace for update matrices.

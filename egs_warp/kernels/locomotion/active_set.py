@@ -29,8 +29,7 @@ OPTIMUM_FOUND, INFEASIBLE, NUMERICAL_FAILURE = wp.constant(0), wp.constant(1), w
 """Status of a solve: optimum found, no point satisfies the bounds, or numerical failure."""
 
 WRONG_SIGN_TOLERANCE = wp.constant(real(1e-9))
-"""Tolerance of multipliers, as a fraction of the largest one. Below minus this tolerance, a multiplier has the wrong
-sign."""
+"""Tolerance of the signs of multipliers, as a fraction of the largest multiplier."""
 REDUNDANCY_TOLERANCE = wp.constant(real(1e-12))
 """Shift of the diagonal of the Gram matrix of the active rows, which is singular if rows are redundant."""
 BOUND_TOLERANCE = wp.constant(real(1e-7))
