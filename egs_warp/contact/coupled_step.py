@@ -29,8 +29,8 @@ PUSH_OUT_FRACTION = 0.2
 """Fraction of the depth beyond the penetration tolerance that a step removes."""
 ACTIVATION_RESIDUAL = 1e-3
 """Residual, divided by dt x weight, below which the end of the step is known accurately enough to search for points
-that would be too deep there. The search is done when the residual of a round first falls below this value, and again at
-the end of the round."""
+that would be too deep at the end. The search is done when the residual of a round first falls below this value, and
+again at the end of the round."""
 COULOMB_TOLERANCE = 1e-6
 """Tolerated violation of Coulomb's law at the end of a step, as a fraction of dt g, the speed that free fall gains in a
 step."""

@@ -105,8 +105,8 @@ def contact_geometry(
 
     End points below an obstacle at rest are shortened to it. Only the vertices of the convex hull of each tetrahedron's
     points are stored: the deformation is affine inside a tetrahedron, so its deepest point is always one of them.
-    Uneven ground can have a bump between them, so there the lowest point of each tetrahedron over each small square is
-    stored too.
+    Uneven ground can have a bump between the vertices. On uneven ground, the lowest point of each tetrahedron over each
+    small square is therefore stored too.
 
     Args:
         cloud: the Gaussians.
@@ -318,7 +318,7 @@ class ContactDetector:
 
         Args:
             inputs: ``points`` (B, K) and ``counts`` (B,); ``positions`` (B, N) m of the nodes at the start of the step;
-                ``gaps`` (B, P) m and ``faces`` (B, P) of all points there.
+                ``gaps`` (B, P) m and ``faces`` (B, P) of all points at ``positions``.
             outputs: ``nodes``, ``weights``, ``axes``, ``gaps`` and ``faces`` (B, K), as in ``ContactSet``.
         """
         launch_cached(

@@ -1,7 +1,8 @@
 """Newton steps with contact on a CPU, in one or two kernel launches each (Eq. 4, 8).
 
 The kernels are in ``kernels/contact/iterate_cpu.py``. ``HostNewtonWorkspace.trial`` moves an iterate along a Newton
-step and evaluates the residual there; ``HostNewtonWorkspace.newton`` solves for the next contact-free velocities.
+step and evaluates the residual of the result; ``HostNewtonWorkspace.newton`` solves for the next contact-free
+velocities.
 """
 
 from __future__ import annotations

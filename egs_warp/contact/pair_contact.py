@@ -28,8 +28,8 @@ BODY_INFLATION = 1.0
 """Inflation of the bounding box of each body, in multiples of its activation distance."""
 TET_INFLATION = 2.0
 """Inflation of the bounding boxes of the tetrahedra, in multiples of the activation distance. It equals the gap at
-which a selected point is dropped. Parts of a body that are further outside its cage cannot be touched, because the
-extrapolation of elements is inaccurate there."""
+which a selected point is dropped. Parts of a body that are further outside its cage cannot be touched, because elements
+extrapolate inaccurately so far outside."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 MAX_CELLS_AT_REST = 32
 """Maximum number of cells that touch the ground at rest. The cage cannot resolve more contact forces than it has nodes
-there."""
+on the ground."""
 _MIN_SPACING = 0.4
 """Minimum spacing of the cells in mean edge lengths of the cage, so that small feet stand on several cells."""
 GAP_TOLERANCE_FRACTION = 1e-7

@@ -238,8 +238,8 @@ class BatchStepper:
     def _parts(
         self, state: BatchState, activations: torch.Tensor, dt: float, max_halvings: int
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
-        """Make a step of ``dt`` seconds. In worlds in which it does not converge, make two half steps instead. A step
-        is halved up to ``max_halvings`` times.
+        """Make a step of ``dt`` seconds. In worlds in which the step does not converge, make two half steps instead. A
+        step is halved up to ``max_halvings`` times.
 
         Returns:
             State of the solved worlds, their steps, and (c,) bool, True for failed worlds.

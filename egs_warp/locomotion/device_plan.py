@@ -295,7 +295,8 @@ class PlanWorkspace:
 
     def _replace_end(self, x: np.ndarray, start: StepInputs) -> None:
         """Replace the expected end of the step by the end for ``x`` (m + 3n,), the result of another search, and start
-        the solve there."""
+        the solve from the new end.
+        """
         body, problem = self.body, start.problem
         with body.stream:
             self._uploaded_point.set(x, np.zeros(len(self._x) - 1 - len(x)), np.ones(1))

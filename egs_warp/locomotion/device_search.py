@@ -88,7 +88,9 @@ class ModeSearchWorkspace:
         self._launch.launch()
 
     def parse_input(self) -> tuple[CoulombProgram, np.ndarray, ContactModes]:
-        """Return the contents of ``packed_qp``: the QP, the activations (m,) at the start, and the modes there."""
+        """Return the contents of ``packed_qp``: the QP, and the activations (m,) and contact modes at the start of the
+        search.
+        """
         return parse_packed_qp(self.packed_qp.numpy())
 
     def search(
@@ -161,7 +163,9 @@ def packed_qp_size(m: int, n: int) -> int:
 
 
 def parse_packed_qp(packed: np.ndarray) -> tuple[CoulombProgram, np.ndarray, ContactModes]:
-    """Return the contents of a packed input: the QP, the activations (m,) at the start, and the modes there."""
+    """Return the contents of a packed input: the QP, and the activations (m,) and contact modes at the start of the
+    search.
+    """
     m, n = int(packed[0]), int(packed[1])
     size = m + 3 * n
     shapes = (size, size), (size,), (3 * n, size), (3 * n,), (m,), (m,), (m,), (n,), (n, 2)

@@ -107,7 +107,7 @@ class EnergyTotals:
     """Energy balance summed over all steps, in units of m g H."""
 
     unit_joules: float
-    """m g H, J."""
+    """m g H in joules, the unit of the other fields."""
     muscle_work: float
     """Sum over segments and steps of max(0, T (L before - L after))."""
     flows: Mapping[str, float]
@@ -175,8 +175,8 @@ def _flows(t: Trajectory, body: _Elements, muscles: _Muscles, step: int) -> tupl
     element_result = body.step(before, after, dt)
     muscle_result = muscles.step(t.activations[step], before, after)
     added = _spin(mass, after, t.velocities[step + 1] - velocity)
-    # The internal forces at the end of the step have no net torque there, but implicit Euler applies them with the
-    # lever arms at the start of the step.
+    # The internal forces at the end of the step have no net torque with the lever arms at the end, but implicit Euler
+    # applies them with the lever arms at the start of the step.
     lost_momentum = -dt * (element_result.torque + muscle_result.torque)
     inner_spin = np.linalg.solve(_inertia(mass, before), lost_momentum - _inertia(mass, after) @ added)
     friction, contact, push_out = _contacts(t, step, displacements)

@@ -25,7 +25,7 @@ PREDICTION_ITERATIONS = 2
 
 @dataclass(frozen=True)
 class PredictedStep:
-    """Predicted end of a step under given activations, and the linearisation there."""
+    """Predicted end of a step under given activations, and the linearisation at this end."""
 
     linearization: ContactLinearization
     normal_bias: np.ndarray

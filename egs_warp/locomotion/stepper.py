@@ -139,7 +139,7 @@ class LocomotionStepper:
         body, muscles = self.body, self.muscles
         self.linearizer = make_linearizer(self.factors, body, muscles, self.solver)
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
-        # One thread, so that the synergies do not depend on the number of threads.
+        # Only one thread is used, so that the synergies do not depend on the number of threads.
         with one_blas_thread():
             problem = StepProblem(body, rest, body.time_unit / MIN_STEPS_PER_TIME_UNIT)
             tangent = problem.tangent(self.factors, rest.velocities, None)

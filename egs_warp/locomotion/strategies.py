@@ -110,7 +110,8 @@ def _search_from(
     program: CoulombProgram, start: np.ndarray, forces: np.ndarray, options: _SearchOptions
 ) -> ModeSearchResult:
     """Search from ``start`` (m + 3n,), in the modes of ``forces`` (n, 3). ``admm`` searches on the device; after a
-    numerical failure there, the host repeats the search with OSQP."""
+    numerical failure of the kernel, the host repeats the search with OSQP.
+    """
     modes = ContactModes.of(forces, program.friction)
     if options.solver is QpSolver.ADMM:
         result = search_modes_device(
@@ -124,8 +125,9 @@ def _search_from(
 def _restart(
     program: CoulombProgram, result: ModeSearchResult, forces: np.ndarray, options: _SearchOptions
 ) -> ModeSearchResult:
-    """Restart from the relaxed optimum (``restart_from_relaxation``); the Coulomb solve there starts from ``forces``
-    (n, 3)."""
+    """Restart from the relaxed optimum (``restart_from_relaxation``). The Coulomb solve for the relaxed activations
+    starts from ``forces`` (n, 3).
+    """
 
     def search(activations: np.ndarray) -> ModeSearchResult:
         start = program.contact_response(activations, forces)

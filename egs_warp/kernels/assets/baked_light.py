@@ -9,8 +9,8 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def fibonacci_cosine_direction(index: int, count: int, turn: float) -> wp.vec3:
-    """Return direction ``index`` of ``count`` directions around +z, distributed with the density of the cosine.
-    ``turn`` (rad) rotates the pattern about z.
+    """Return direction ``index`` of ``count`` cosine-distributed directions about +z. ``turn`` (rad) rotates the
+    pattern about z.
     """
     u = (float(index) + 0.5) / float(count)
     angle = 2.39996323 * float(index) + turn

@@ -241,7 +241,7 @@ def measure_bend_kernel(
             # The mixed derivative is symmetric, so it is measured over the longer baseline only.
             if scales[j] > scales[k]:
                 axis_error = 0.0
-            # Ignore axes that are too short to be visible.
+            # Axes that are too short to be visible are ignored.
             if axis_error > 0.25 * error[k]:
                 curl[k] = wp.max(curl[k], angle)
             error[k] = wp.max(error[k], axis_error)

@@ -117,7 +117,7 @@ class ActiveSet:
 
 @wp.func
 def bound_of(rows: UnitConstraints, state: ActiveSet, row: int):
-    """Return the bound at which the active ``row`` is."""
+    """Return the active bound of ``row``."""
     if state.side[row] > 0:
         return rows.lower[row]
     return rows.upper[row]

@@ -1,7 +1,7 @@
 """Gaussian elimination, and Cholesky factors of inverses, for all threads of a block on a GPU or one thread on a CPU.
 
-Both proceed in blocks of eight unknowns. One warp processes the diagonal block in registers; all threads apply the
-result to the rest of the matrix.
+Both algorithms proceed in blocks of eight unknowns. One warp processes the diagonal block in registers; all threads
+apply the result to the rest of the matrix.
 """
 
 import warp as wp

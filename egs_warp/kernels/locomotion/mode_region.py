@@ -46,7 +46,7 @@ START_ROUNDING = 1e-6
 redundant."""
 
 CURRENT, NEXT, NEXT_SINGLE, WARM_START = 0, 1, 2, 3
-"""Slots of ``Workspace.kinds`` and ``Workspace.slips`` (documented there)."""
+"""Slots of ``Workspace.kinds`` and ``Workspace.slips``; ``Workspace.kinds`` describes them."""
 ROW_TOLERANCE = wp.constant(real(1e-8))
 """Tolerated violation of a row. For rows longer than 1, it is multiplied by the length of the row."""
 

@@ -19,7 +19,9 @@ PADDING = wp.constant(16)
 
 
 class SsimKernels(NamedTuple):
-    """Kernels of SSIM. For a row of w pixels they use ceil(3 w / lanes) threads, which are the argument ``blocks``."""
+    """Kernels of SSIM. For a row of w pixels they use ceil(3 w / lanes) threads; this number is the argument
+    ``blocks``.
+    """
 
     lanes: int
     """Number of floats that a thread computes."""
@@ -69,7 +71,7 @@ def ssim_kernels(module: str, lanes: int) -> SsimKernels:
         bb_out: wp.array[wp.float32],
         ab_out: wp.array[wp.float32],
     ):
-        """Blur both images and their products along the rows, without the columns."""
+        """Blur both images and their products along the rows only."""
         thread = first_row + wp.tid()
         at = PADDING + (REACH + thread // blocks) * pitch + (thread % blocks) * wp.static(lanes)
         mean_a = numbers()
