@@ -263,7 +263,7 @@ def sweep_by_block(
         values.data[n + 1] = b;
         values.data[n + 2] = c;
         most = fmax(most, speed * fmax(fabs(a), fmax(fabs(b), fabs(c))));
-        // A maximum ignores NaN, a sum does not.
+        // The maximum ignores NaN; the sum of squares does not.
         square += speed * speed * (a * a + b * b + c * c) + 0.0 * trial;
     }
     if (32 * warp < count) {

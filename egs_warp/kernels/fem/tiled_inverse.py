@@ -53,7 +53,7 @@ _SETUP_CODE = """
     double *const S = matrix.data, *const R = inverse.data;
     const int stride = matrix.strides[0] / 8, out_stride = inverse.strides[0] / 8;
     const int2* const pair_list = (const int2*)pairs.data;
-    // Columns of tiles whose products are summed, or a tile that is multiplied or factored.
+    // Memory for the columns of tiles whose products are summed, or for a tile that is multiplied or factored.
     __shared__ __align__(16) double scratch[2 * SLOTS * CHUNK];
     int* const next_task = (int*)scratch;
     const int lane = threadIdx.x, warp = lane >> 5, own = lane & 31, r = own >> 2, q = own & 3;

@@ -51,7 +51,7 @@ _SHARED = (
 
 _EACH_BLOCK = """
         for (int k = 0; k < count; ++k) {
-            // The processor cannot predict the number of blocks of a splat: it is computed well before it is used.
+            // The processor cannot predict the number of blocks of a splat, so it is computed well before its use.
             const int id = gaussians.data[begin + k];
             if (begin + k + BATCH < end) {
                 const int next_id = gaussians.data[begin + k + BATCH];
