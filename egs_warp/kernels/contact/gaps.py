@@ -146,8 +146,12 @@ def all_gaps_kernel(
 ):
     """Compute the gaps like ``point_gaps_kernel``, with one CPU thread for all points of a world.
 
-    Arrays must be contiguous. ``heights`` (planes x nodes,) is a workspace for the signed distances of the nodes in
-    metres, from which those of the points are interpolated linearly. The worlds of a launch on a CPU run one after the
-    other and share the workspace.
+    Arrays must be contiguous. The worlds of a launch on a CPU run one after the other and share the workspace.
+
+    Args:
+        nodes, weights, planes, solid_from_plane, positions: as in ``point_gaps_kernel``.
+        heights: (planes x nodes,) m, workspace for the signed distances of the nodes, from which those of the points
+            are interpolated linearly.
+        gaps_out, planes_out: as in ``point_gaps_kernel``.
     """
     write_gaps(nodes, weights, planes, solid_from_plane, positions, wp.tid(), heights, gaps_out, planes_out)

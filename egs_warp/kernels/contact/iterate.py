@@ -22,8 +22,12 @@ def select_base_kernel(
     # Out:
     base_out: wp.array[real],
 ):
-    """Copy an iterate into the base slot ``base_out``: ``trial`` if ``slot`` (1,) is 1, ``start`` if it is 2; leave the
-    base unchanged if it is 0.
+    """Copy an iterate into the base slot.
+
+    Args:
+        slot: (1,) 1 to copy ``trial``, 2 to copy ``start``, 0 to leave the base unchanged.
+        trial, start: packed iterates.
+        base_out: packed iterate, the base.
     """
     i = wp.tid()
     if slot[0] == real(1.0):

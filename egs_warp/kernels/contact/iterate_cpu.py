@@ -280,11 +280,21 @@ def trial_kernel(
     free_residual_out: wp.uint64,
     norm_out: wp.array[real],
 ):
-    """Evaluate a trial: run ``advance_trial``, compute the gradient of the internal energy, and run ``step_residual``,
-    whose docstrings give the arguments.
+    """Evaluate a trial: run ``advance_trial``, compute the gradient of the internal energy, and run ``step_residual``.
 
-    If ``length`` is 0, ``free_velocities`` and ``columns`` are not read. ``norm_out`` (1,) N s is the norm of the
-    residual with contact forces.
+    If ``length`` is 0, ``free_velocities`` and ``columns`` are not read.
+
+    Args:
+        elements, lines: mesh and muscle segments (``gradient_native``).
+        step, dt, ratio, contacts, contact_nodes, contact_weights, contact_axes: the step (``step_residual``).
+        starts: F^T F of the elements at the start of the step (``elasticity_cpu.starts_kernel``).
+        columns: velocities that unit contact forces cause (``advance_trial``).
+        base, free_velocities, forces, target_forces, length: Newton step and its fraction (``advance_trial``).
+        ends: (N, 3) m, output: end positions.
+        gradient: (N, 3) newtons, output: gradient of the internal energy.
+        residual_out, free_residual_out: residual with and without contact forces (``step_residual``).
+        velocities_out, forces_out: velocities and forces of the trial (``advance_trial``).
+        norm_out: (1,) N s, norm of the residual with contact forces.
     """
     advance_trial(
         step.positions, dt, base, free_velocities, columns, 3 * contacts, forces, target_forces, length,

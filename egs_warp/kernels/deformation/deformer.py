@@ -154,7 +154,14 @@ def deform_kernel(
     log_scales_out: wp.array[wp.vec3],
     polar_rotations_out: wp.array[wp.vec4],
 ):
-    """Deform each Gaussian with the cage (Eq. 14, 15). ``polar_rotations_out`` are the rotations R_polar."""
+    """Deform each Gaussian with the cage (Eq. 14, 15).
+
+    Args:
+        means, rotations, log_scales: (n,) the Gaussians at rest.
+        max_stretch, cage, plan: as in the module docstring.
+        means_out, rotations_out, log_scales_out: (n,) the deformed Gaussians.
+        polar_rotations_out: (n,) rotations R_polar.
+    """
     row = first_row + wp.tid()
     result = deform_gaussian(
         row,
@@ -210,9 +217,16 @@ def measure_bend_kernel(
     deviation of the motion from an affine map.
 
     With arms of length L on both sides of axis k, the second derivative of the motion along axes k and j is about (F_k+
-    - F_k-) r_j / 2L. ``curl_out`` is the maximum over j of the angle, in degrees, between the two vectors F_k+- r_j.
-    ``error_out`` is the displacement, in metres, that F does not represent at one standard deviation along both axes.
-    ``bend_out`` is the angle of Eq. (16) in degrees.
+    - F_k-) r_j / 2L.
+
+    Args:
+        means, rotations, log_scales: (n,) the Gaussians at rest.
+        max_stretch, cage, plan: as in the module docstring.
+        arms: (n, 6) m, lengths of the arms.
+        bend_out: (n,) degrees, maximum of the angle of Eq. (16).
+        curl_out: (n,) degrees, for each axis k the maximum over j of the angle between the two vectors F_k+- r_j.
+        error_out: (n,) m, for each axis the maximum displacement that F does not represent at one standard deviation
+            along both axes.
     """
     row = first_row + wp.tid()
     if plan.mean_tets[row] < 0 and plan.inside_fractions[0, row] == RIGID:

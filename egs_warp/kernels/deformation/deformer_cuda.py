@@ -123,8 +123,14 @@ def deform_with_colour_kernel(
     polar_rotations_out: wp.array[wp.vec4],
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Deform each Gaussian and rotate its colour, as ``deform_kernel`` and ``rotate_sh_kernel`` do, in one pass;
+    """Deform each Gaussian and rotate its colour in one pass, as ``deform_kernel`` and ``rotate_sh_kernel`` do;
     launched over whole blocks.
+
+    Args:
+        count: number n of Gaussians.
+        means, rotations, log_scales, max_stretch, cage, plan: as in ``deform_kernel``.
+        sh, sh_out: (n, 16) coefficients of the colours before and after the rotation.
+        means_out, rotations_out, log_scales_out, polar_rotations_out: as in ``deform_kernel``.
     """
     row = wp.tid()
     space = warp_space()

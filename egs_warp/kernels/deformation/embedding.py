@@ -317,7 +317,14 @@ def interpolate_points_kernel(
     # Out:
     points_out: wp.array[Vec3],
 ):
-    """Compute the position of each embedded point (Eq. 2) for the node ``positions`` (N,) m."""
+    """Compute the position of each embedded point (Eq. 2).
+
+    Args:
+        nodes: (n,) nodes of the tetrahedron of each point.
+        weights: (n,) barycentric weights.
+        positions: (N,) m, nodes of the cage.
+        points_out: (n,) m.
+    """
     row = first_row + wp.tid()
     n = nodes[row]
     w = weights[row]
@@ -335,7 +342,13 @@ def nearest_face_kernel(
     # Out:
     faces_out: wp.array[wp.int32],
 ):
-    """Find the triangle of the cage's surface that is nearest to each point."""
+    """Find the triangle of the cage's surface that is nearest to each point.
+
+    Args:
+        points: (n,) m.
+        origin, extent, surface: the cage (module docstring).
+        faces_out: (n,) index of the triangle.
+    """
     row = first_row + wp.tid()
     point = points[row] - single(origin)
     location = wp.mesh_query_point_no_sign(surface, point, wp.length(point) + 2.0 * wp.float32(extent))

@@ -192,8 +192,12 @@ def rotate_sh_kernel(
     # Out:
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Rotate the coefficients of each Gaussian's colour by the unit quaternions ``turns`` (w, x, y, z); band 0 is not
-    written.
+    """Rotate the coefficients of each Gaussian's colour; band 0 is not written.
+
+    Args:
+        turns: (n,) unit quaternions w, x, y, z.
+        sh, sh_out: (n, coefficients) before and after the rotation.
+        degree: degree of the coefficients, 1 to 3.
     """
     row = first_row + wp.tid()
     count = (degree + 1) * (degree + 1)

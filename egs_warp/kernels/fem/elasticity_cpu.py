@@ -345,8 +345,12 @@ def projected_hessian_native(
 
 @wp.kernel
 def starts_kernel(elements: Elements, positions: wp.array2d[real], starts_out: wp.array[real]) -> None:
-    """Write the upper triangles ``starts_out`` (T / 4, 6, 4) of F^T F at ``positions`` (N, 3) m, from which the damping
-    measures strain.
+    """Compute F^T F of all elements, from which the damping measures strain.
+
+    Args:
+        elements: the mesh.
+        positions: (N, 3) m, nodes at the start of the step.
+        starts_out: (T / 4, 6, 4) upper triangles, flat.
     """
     starts_native(elements, positions, starts_out)
 

@@ -461,7 +461,15 @@ def solve_kernel(
 ) -> None:
     """Solve for all right-hand sides: take panels from counter 0 and call ``solve_panel_native`` for each of them.
 
-    Several launches may share ``counters`` and so the work; the other arguments are those of ``solve_panel_native``.
+    A single right-hand side is solved by ``solve_vector_native``. Several launches may share the work.
+
+    Args:
+        counters: shared counters, of which the first is the next panel.
+        fronts, blocks, unknowns, factor, inverses, reciprocals: factors of S (``solve_panel_native``).
+        right, row_stride, column_stride, count: address, strides and number of the right-hand sides.
+        projection: momentum projection of the solutions.
+        workspace: scratch memory of ``solve_panel_native``.
+        solution: address of the output (n, count), float64.
     """
     if count == 1:
         solve_vector_native(

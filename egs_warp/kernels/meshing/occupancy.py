@@ -79,8 +79,13 @@ def enclosed_kernel(
     # Out:
     filled_out: wp.array3d[wp.uint8],
 ):
-    """Fill the empty points from which at least ``min_hits`` of the 26 lattice directions hit the object or the ground,
-    which is everything below layer 0. Unlike a flood fill, this test tolerates small holes in the capture.
+    """Fill the empty points from which enough lattice directions hit the object or the ground, which is everything
+    below layer 0. Unlike a flood fill, this test tolerates small holes in the capture.
+
+    Args:
+        occupied: (nx, ny, nz) 1 for occupied points.
+        min_hits: minimum number of hits among the 26 lattice directions.
+        filled_out: (nx, ny, nz) 1 for points that are occupied or filled.
     """
     x, y, z = wp.tid()
     if occupied[x, y, z] != wp.uint8(0):

@@ -201,8 +201,14 @@ def coverage_kernel(
     # Out:
     coverage: wp.array3d[wp.int64],
 ):
-    """Add the coverage of each Gaussian to its texel in ``coverage`` (layers, rows, columns). The coverage is the
-    Gaussian's opacity times the area of its broadest side, in texels.
+    """Add the coverage of each Gaussian to the shadow map. The coverage is the Gaussian's opacity times the area of its
+    broadest side, in texels.
+
+    Args:
+        ground: plane and disc.
+        layers: height ranges of the layers.
+        means, log_scales, opacity_logits: (n,) the Gaussians.
+        coverage: (layers, rows, columns) sums in fixed point, updated.
     """
     g = wp.tid()
     away = means[g] - ground.centre
@@ -230,7 +236,7 @@ def unpack_coverage_kernel(
     # Out:
     coverage_out: wp.array3d[wp.float32],
 ):
-    """Convert the coverage from fixed point to floating point."""
+    """Convert the coverage (layers, rows, columns) from fixed point to floating point."""
     tid = wp.tid() + first_row
     layer = tid / (TEXELS * TEXELS)
     row = (tid / TEXELS) % TEXELS
@@ -246,7 +252,7 @@ def occupied_rows_kernel(
     # Out:
     occupied_out: wp.array[wp.bool],
 ):
-    """Write True for each row of a layer that has a nonzero texel."""
+    """Write True for each row of ``source`` (layers, rows, columns) that has a nonzero texel."""
     tid = wp.tid() + first_row
     occupied = wp.bool(False)
     for column in range(TEXELS):
@@ -296,7 +302,7 @@ def opacity_kernel(
     # In and out:
     layers: wp.array3d[wp.float32],
 ):
-    """Convert the coverage in ``layers`` to opacity, 1 - exp(-coverage), in place."""
+    """Convert the coverage in ``layers`` (layers, rows, columns) to opacity, 1 - exp(-coverage), in place."""
     tid = wp.tid() + first_row
     layer = tid / (TEXELS * TEXELS)
     row = (tid / TEXELS) % TEXELS
@@ -313,8 +319,12 @@ def combine_layers_kernel(
     # Out:
     shade_out: wp.array2d[wp.float32],
 ):
-    """Combine the layers to one shadow: the transmitted light is the product of the fractions that the layers
-    transmit.
+    """Combine the layers to one shadow: the transmitted light is the product of the fractions that the layers transmit.
+
+    Args:
+        opacity: (layers, rows, columns) opacities.
+        max_opacity: maximum opacity of each layer.
+        shade_out: (rows, columns) opacity of the shadow.
     """
     tid = wp.tid() + first_row
     row = tid / TEXELS

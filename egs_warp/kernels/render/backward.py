@@ -241,6 +241,14 @@ def project_backward_kernel(
 ):
     """Compute the gradient with respect to the attributes of one Gaussian per thread; zero if the Gaussian reaches no
     tile.
+
+    Args:
+        view: camera.
+        antialiased, means, rotations, log_scales, opacity_logits, sh: as in ``projection``.
+        slot_end: (n,) end of each Gaussian's slots.
+        moments: (slots, 3) moments of ``composite_backward_tile_kernel``.
+        by_mean_out, by_rotation_out, by_log_scale_out, by_opacity_logit_out: (n,) gradients.
+        by_sh_out: (n, coefficients) gradients.
     """
     g = wp.tid() + first
     slot = first_slot_of(slot_end, g)
@@ -290,6 +298,13 @@ def pose_backward_kernel(
     contribution to the gradient with respect to the camera pose.
 
     Outputs that are not requested are empty arrays.
+
+    Args:
+        view: camera.
+        antialiased, means, rotations, log_scales, sh, slot_end, moments: as in ``project_backward_kernel``.
+        by_screen_out: (n,) gradients with respect to the screen position in pixels.
+        by_pose_rotation_out: (n,) contributions to the gradient with respect to the rotation matrix of the camera.
+        by_pose_translation_out: (n,) contributions to the gradient with respect to the translation of the camera.
     """
     g = wp.tid() + first
     slot = first_slot_of(slot_end, g)

@@ -122,7 +122,14 @@ def composite_tile_kernel(
     alpha_out: wp.array2d[wp.float32],
     depth_out: wp.array2d[wp.float32],
 ):
-    """Composite one tile by one thread (CPU), or by one block of ``TILE_PIXELS`` threads (CUDA)."""
+    """Composite one tile by one thread (CPU), or by one block of ``TILE_PIXELS`` threads (CUDA).
+
+    Args:
+        width, height, tile_start, tile_mask, ellipse, falloff, colour_depth: as in the module docstring.
+        gaussian_from_intersection: Gaussian of each intersection.
+        flat_background, background, max_depth: as in ``composite_tile``.
+        colour_out, alpha_out, depth_out: (height, width) outputs; the depth is the alpha-weighted mean.
+    """
     tile = (wp.tid() + first) / wp.block_dim()
     columns = (width + TILE - 1) / TILE
     start = tile_start[tile]

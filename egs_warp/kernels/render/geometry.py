@@ -28,6 +28,11 @@ def splat_normals_kernel(
 ):
     """Compute the unit vector along the thinnest axis of every Gaussian, in camera axes and pointing towards the
     camera.
+
+    Args:
+        view: camera.
+        means, rotations, log_scales: (n,) as in ``projection``.
+        normal_out: (n,) unit vectors.
     """
     g = wp.tid() + first
     s = log_scales[g]

@@ -24,7 +24,15 @@ def compact_visible_kernel(
     gaussian_out: wp.array[wp.int32],
     count_out: wp.array[wp.int32],
 ):
-    """List the Gaussians that reach a tile, and their depths, by one thread. ``count_out`` (1,) is their number."""
+    """List the Gaussians that reach a tile, by one thread.
+
+    Args:
+        slot_end: (n,) end of each Gaussian's slots.
+        colour_depth: (n,) colour and z-depth.
+        depth_out: z-depths of the Gaussians in the list.
+        gaussian_out: indices of these Gaussians.
+        count_out: (1,) length of the list.
+    """
     count = wp.int32(0)
     before = wp.int64(0)
     for g in range(slot_end.shape[0]):
@@ -50,8 +58,15 @@ def split_ranks_kernel(
 ):
     """Split the depth order into chunks with about equal numbers of pairs, by one thread.
 
-    Near Gaussians reach more tiles than far ones, so the chunks have different numbers of Gaussians. The outputs are
-    the first rank and the first pair of each chunk.
+    Near Gaussians reach more tiles than far ones, so the chunks have different numbers of Gaussians.
+
+    Args:
+        visible_count: number of visible Gaussians.
+        pair_count: number of pairs.
+        gaussian_from_rank: (visible_count,) Gaussians in depth order.
+        slot_end: (n,) end of each Gaussian's slots.
+        chunk_start_out: (chunks + 1,) first rank of each chunk.
+        pair_start_out: (chunks + 1,) first pair of each chunk.
     """
     chunks = chunk_start_out.shape[0] - 1
     chunk = wp.int32(0)
@@ -159,10 +174,15 @@ def count_tiles_kernel(
     tile_from_pair_out: wp.array[wp.int32],
     count_out: wp.array2d[wp.int32],
 ):
-    """Write the tiles of the Gaussians of one chunk per thread, and count the Gaussians in each tile.
+    """Write the tiles of the Gaussians of one chunk per thread, and count the Gaussians in each tile. Pairs are
+    numbered in depth order here.
 
-    Pairs are numbered in depth order here; ``tile_from_pair_out`` has four spare entries after the pairs of each chunk.
-    ``count_out`` is (chunks, tiles).
+    Args:
+        width, height: size of the image, pixels.
+        chunk_start, pair_start, gaussian_from_rank: the chunks (``split_ranks_kernel``).
+        ellipse, falloff: splats (``projection.project_kernel``).
+        tile_from_pair_out: tile of each pair, with four spare entries after the pairs of each chunk.
+        count_out: (chunks, tiles) numbers of Gaussians.
     """
     count_tiles(
         wp.tid() + first_chunk,
@@ -229,8 +249,13 @@ def fill_tiles_kernel(
     gaussian_from_intersection_out: wp.array[wp.int32],
     slot_from_intersection_out: wp.array[wp.int32],
 ):
-    """Append the Gaussians of one chunk per thread to their tiles. ``cursor_out`` (chunks, tiles) is the intersection
-    at which the chunk's next entry of each tile is written.
+    """Append the Gaussians of one chunk per thread to their tiles.
+
+    Args:
+        chunk_start, pair_start, gaussian_from_rank, slot_end: the chunks (``split_ranks_kernel``).
+        tile_from_pair: tile of each pair (``count_tiles_kernel``).
+        cursor_out: (chunks, tiles) intersection at which the chunk's next entry of each tile is written, updated.
+        gaussian_from_intersection_out, slot_from_intersection_out: Gaussian and slot of each intersection.
     """
     fill_tiles(
         wp.tid() + first_chunk,

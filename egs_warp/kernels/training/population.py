@@ -28,8 +28,14 @@ def regularization_kernel(
     opacity_gradient_out: wp.array[wp.float32],
     scale_gradient_out: wp.array[wp.vec3],
 ):
-    """Add the derivatives of the regularisation to the gradients: ``by_opacity`` times the sum of the opacities, and
-    ``by_scale`` times the sum of the scales.
+    """Add the derivatives of the regularisation to the gradients.
+
+    Args:
+        by_opacity: weight of the sum of the opacities.
+        by_scale: weight of the sum of the scales.
+        opacity_logits, log_scales: (n,) the Gaussians.
+        opacity_gradient_out: (n,) gradients with respect to the logits, updated.
+        scale_gradient_out: (n,) gradients with respect to the logarithms of the scales, updated.
     """
     n = first_row + wp.tid()
     opacity = sigmoid(opacity_logits[n])
@@ -49,8 +55,14 @@ def jitter_kernel(
     opacity_logits: wp.array[wp.float32],
     means_out: wp.array[wp.vec3],
 ):
-    """Displace each mean by ``size`` times its covariance times ``noise``. The displacement is smaller for Gaussians
-    with opacities above ``faint``.
+    """Displace each mean by a multiple of its covariance times ``noise``, which is smaller for more opaque Gaussians.
+
+    Args:
+        size: factor of the displacements.
+        faint: opacity around which the displacement decreases.
+        noise: (n,) random vectors.
+        rotations, log_scales, opacity_logits: (n,) the Gaussians.
+        means_out: (n,) means, updated.
     """
     n = first_row + wp.tid()
     gate = sigmoid(-STEEPNESS * (sigmoid(opacity_logits[n]) - faint))

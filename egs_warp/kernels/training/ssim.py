@@ -3,7 +3,8 @@
 An image is stored by rows, with three floats per pixel. A thread computes several consecutive floats of a row:
 ``ssim_cpu.py`` has the kernels for a vector register, ``ssim_cuda.py`` those for a single float. Each row ends with at
 least ``PADDING`` zeros, and there are ``REACH`` rows of zeros above and below the image, so the window needs no bounds
-check. The window is separable: it is applied along the rows first, then along the columns.
+check. The window is separable: it is applied along the rows first, then along the columns. ``pitch`` is the number of
+floats of a padded row, and ``window`` (2 REACH + 1,) the weights.
 """
 
 from typing import Any, NamedTuple
