@@ -51,7 +51,7 @@ class DeformedShape:
         """Constant arguments of the kernels: tetrahedra, rest positions, hierarchy, lattice and coefficients."""
 
     def place(self, positions: np.ndarray) -> None:
-        """Move the nodes to ``positions`` (N, 3)."""
+        """Move the nodes to ``positions`` (N, 3) m."""
         copy_into(self.positions, positions[None])
         self._compute_boxes()
         self.hierarchy.refit()

@@ -135,8 +135,8 @@ class DeviceContactLinearization(ContactLinearization):
     def running_iterate_at(
         self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> DeviceNewtonIterate:
-        """Start a trial at ``velocities`` and ``forces`` asynchronously and return its iterate, which is then in the
-        ``trial`` slot.
+        """Start a trial at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) newtons, asynchronously, and return its
+        iterate, which is then in the ``trial`` slot.
         """
         assert self.owner.current is self
         workspace = self.workspace
@@ -268,7 +268,7 @@ class DeviceNewtonIterate:
         return np.array_equal(tension.tensions, self.tension.tensions)
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> DeviceNewtonIterate:
-        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3) newtons."""
         self._wait_tangent()
         workspace, problem = self.linearization.workspace, self.linearization.tangent.problem
         assert self.linearization.owner.current is self.linearization

@@ -40,7 +40,7 @@ class IterateBuffer:
 
     @classmethod
     def of(cls, contacts: ContactSet, velocities: np.ndarray, forces: np.ndarray) -> IterateBuffer:
-        """Create a buffer with nodal ``velocities`` (N, 3) and contact ``forces`` (n, 3)."""
+        """Create a buffer with nodal ``velocities`` (N, 3) m/s and contact ``forces`` (n, 3) newtons."""
         state = cls(contacts)
         state.velocities[:], state.forces[:] = velocities, forces
         return state

@@ -79,7 +79,9 @@ class ContactLinearization:
         return type(self).of(self.tangent, contacts, columns)
 
     def iterate_at(self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray) -> NewtonIterate:
-        """Return the Newton iterate at ``velocities`` (N, 3) and contact ``forces`` (n, 3), under ``tension``."""
+        """Return the Newton iterate at ``velocities`` (N, 3) m/s and contact ``forces`` (n, 3) newtons, under
+        ``tension``.
+        """
         return NativeNewtonIterate.at(self, tension, velocities, forces)
 
 
@@ -204,7 +206,7 @@ class NewtonIterate(Protocol):
         ...
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> NewtonIterate:
-        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3) newtons."""
         ...
 
     def newton_steps(
@@ -271,7 +273,7 @@ class NativeNewtonIterate(HostNewtonStep):
     def at(
         cls, response: ContactLinearization, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> Self:
-        """Evaluate the iterate at ``velocities`` (N, 3) and ``forces`` (n, 3)."""
+        """Evaluate the iterate at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) newtons."""
         state = IterateBuffer.of(response.contacts, velocities, forces)
         return cls(response, tension, *_workspace_of(response).trial(response.tangent.problem, tension, state))
 
@@ -304,7 +306,7 @@ class NativeNewtonIterate(HostNewtonStep):
         return self._after.free_contact_velocities
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:
-        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3) newtons."""
         response = self.linearization
         step = response.columns_address, forces, length
         state_and_norm = _workspace_of(response).trial(response.tangent.problem, self.tension, self._after, step)

@@ -89,7 +89,7 @@ class PairContactDetector:
         return np.column_stack([bodies, others - 1, points - self.point_starts[bodies]])
 
     def body_pairs(self, positions: np.ndarray) -> list[tuple[int, int]]:
-        """Return the ordered pairs (a, b) of bodies whose inflated boxes overlap at ``positions`` (N, 3), both (a, b)
+        """Return the ordered pairs (a, b) of bodies whose inflated boxes overlap at ``positions`` (N, 3) m, both (a, b)
         and (b, a), in ascending order. Two driven bodies do not form a pair.
         """
         boxes = []

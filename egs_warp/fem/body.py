@@ -106,7 +106,7 @@ class SoftBody:
         return np.trace(second) * np.eye(3) - second
 
     def best_fit_rotation(self, positions: np.ndarray) -> np.ndarray:
-        """Return the mass-weighted best-fit rotation (3, 3) from the rest shape to ``positions`` (N, 3) (Kabsch)."""
+        """Return the mass-weighted best-fit rotation (3, 3) from the rest shape to ``positions`` (N, 3) m (Kabsch)."""
         rest = self.mesh.nodes - self.centre_of_mass(self.mesh.nodes)
         arms = positions - self.centre_of_mass(positions)
         return kabsch_rotation(self.node_mass, rest, arms)

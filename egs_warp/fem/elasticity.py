@@ -87,7 +87,7 @@ class ElasticAssembly:
         return self._segments
 
     def determinants(self, positions: np.ndarray) -> np.ndarray:
-        """Return J = det F (T,) at ``positions`` (N, 3); not positive where an element is inverted."""
+        """Return J = det F (T,) at ``positions`` (N, 3) m; not positive where an element is inverted."""
         self.elements.enqueue_energies(*self._upload(positions, None))
         return self._energies.get()[: len(self.mesh.tets)]
 

@@ -86,7 +86,7 @@ class SimdElasticity:
         return [positions, self._no_start if start is None else start, dt]
 
     def enqueue_start(self, positions: wp.array, start: wp.array) -> None:
-        """Compute F^T F of all elements at ``positions`` (N, 3), the reference of the damping of a step."""
+        """Compute F^T F of all elements at ``positions`` (N, 3) m, the reference state of the damping of a step."""
         self._launch(kernels.starts_kernel, [positions], [start])
 
     def enqueue_energies(self, positions: wp.array, start: wp.array | None, dt: float) -> tuple[wp.array, wp.array]:

@@ -99,7 +99,7 @@ class ContactModes:
 
     @classmethod
     def of(cls, forces: np.ndarray, friction: float) -> ContactModes:
-        """Return the modes of ``forces`` (n, 3), body weights, that satisfy Coulomb's law."""
+        """Return the modes of ``forces`` (n, 3), in body weights, that satisfy Coulomb's law."""
         tangential = np.linalg.norm(forces[:, 1:], axis=1)
         touching = forces[:, 0] > kernels.ZERO_FORCE
         sliding = touching & (tangential >= kernels.CONE_FRACTION * friction * forces[:, 0])

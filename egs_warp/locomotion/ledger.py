@@ -250,7 +250,7 @@ class _Elements:
         return cls(t.tets, np.linalg.inv(edges), volumes, mu, lam, t.damping_time)
 
     def gradients(self, positions: np.ndarray) -> np.ndarray:
-        """Return (T, 3, 3) F at ``positions`` (N, 3)."""
+        """Return the deformation gradients F (T, 3, 3) at ``positions`` (N, 3) m."""
         return _edges(positions, self.tets) @ self.rest_inverses
 
     def energy(self, positions: np.ndarray) -> float:

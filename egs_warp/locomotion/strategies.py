@@ -109,8 +109,8 @@ def _search_with_restart(
 def _search_from(
     program: CoulombProgram, start: np.ndarray, forces: np.ndarray, options: _SearchOptions
 ) -> ModeSearchResult:
-    """Search from ``start`` (m + 3n,), in the modes of ``forces`` (n, 3). ``admm`` searches on the device; after a
-    numerical failure of the kernel, the host repeats the search with OSQP.
+    """Search from ``start`` (m + 3n,), in the modes of ``forces`` (n, 3) body weights. ``admm`` searches on the device;
+    after a numerical failure of the kernel, the host repeats the search with OSQP.
     """
     modes = ContactModes.of(forces, program.friction)
     if options.solver is QpSolver.ADMM:
@@ -126,7 +126,7 @@ def _restart(
     program: CoulombProgram, result: ModeSearchResult, forces: np.ndarray, options: _SearchOptions
 ) -> ModeSearchResult:
     """Restart from the relaxed optimum (``restart_from_relaxation``). The Coulomb solve for the relaxed activations
-    starts from ``forces`` (n, 3).
+    starts from ``forces`` (n, 3) body weights.
     """
 
     def search(activations: np.ndarray) -> ModeSearchResult:
