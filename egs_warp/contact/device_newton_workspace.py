@@ -199,7 +199,7 @@ class NewtonWorkspace:
     def start_trial(
         self, problem: StepProblem, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> None:
-        """Start a trial at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) newtons, under ``tension``, asynchronously."""
+        """Start a trial asynchronously, at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) N, under ``tension``."""
         with self.owner.stream:
             self.upload_start(tension, velocities, forces)
             self._upload_trial(0.0, False, forces, FROM_START)

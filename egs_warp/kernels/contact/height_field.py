@@ -40,7 +40,7 @@ def height_and_slopes(axes: Mat33, origin: Vec3, spacing: real, coefficients: wp
     v = away[1] / spacing
     rows = coefficients.shape[0]
     columns = coefficients.shape[1]
-    # Far outside, the edge value extends without limit, so clamping the index changes nothing.
+    # Far outside the lattice the height is that of the edge, so clamping the indices changes nothing.
     column = wp.clamp(wp.floor(u + real(0.5)), real(-2.0), real(columns) + real(2.0))
     row = wp.clamp(wp.floor(v + real(0.5)), real(-2.0), real(rows) + real(2.0))
     across = spline_weights(wp.clamp(u - column, real(-0.5), real(0.5)))

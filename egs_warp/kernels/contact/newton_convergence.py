@@ -90,7 +90,7 @@ def begin_loop_kernel(
         enabled: (c,) 0 to skip the loop.
         sizes: (c,) residual norms of the last trials, before the division by the ``UNIT`` of the row.
         progress: (c, ``ROW_SIZE``) progress, updated.
-        running_out: (c,) condition of the loop, ``enabled``.
+        running_out: (c,) condition of the loop, equal to ``enabled``.
     """
     world = wp.tid()
     if progress[world, _RESIDUAL] < real(0.0):

@@ -41,7 +41,7 @@ PIVOTS = wp.constant(600)
 RESTARTS = wp.constant(8)
 """Maximum number of restarts if rounding leaves a violated row or a multiplier of the wrong sign."""
 _CHECK_INTERVAL = wp.constant(8)
-"""Number of dual iterations between two checks of the cost limit and for cancellation."""
+"""Number of dual iterations between two checks for the cost limit and for cancellation."""
 
 
 @wp.struct
