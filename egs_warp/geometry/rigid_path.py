@@ -37,7 +37,7 @@ class RigidPath:
         if len(times) < 2 or not (np.diff(times) > 0.0).all() or not np.isfinite(times).all():
             raise UserError("path: give at least one point, and ascending times above 0 s")
         if len(shifts) != len(times) or len(turns) != len(times):
-            raise UserError("path: give a shift, and if any a turn, for each time")
+            raise UserError("path: give one shift for each time, and either no turns or one for each time")
         if not (np.isfinite(shifts).all() and np.isfinite(turns).all()):
             raise UserError("path: give finite shifts and turns")
         if self.repeat and (shifts[-1].any() or turns[-1] % 360.0 != 0.0):

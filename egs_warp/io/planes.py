@@ -116,7 +116,10 @@ class PlaneRecord:
         nx, ny, nz = normal.tolist()
         plane = Plane.from_coefficients(nx, ny, nz, offset)
         if abs(plane.offset) > MAX_COORDINATE:
-            raise UserError(f"{path}: plane {number} lies {abs(plane.offset):g} units from the origin; make it again")
+            raise UserError(
+                f"{path}: plane {number} lies {abs(plane.offset):g} units from the origin, the limit is"
+                f" {MAX_COORDINATE:g}; make it again"
+            )
         try:
             centre = np.array(entry["centre"], dtype=float).reshape(3) if "centre" in entry else None
             numbers = {name: float(entry[name]) for name in _NUMBERS if name in entry}

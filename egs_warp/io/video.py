@@ -41,7 +41,7 @@ def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[s
     import cv2
 
     if len(frames) != len(labels) or not frames:
-        raise UserError(f"contact sheet: {len(frames)} frames and {len(labels)} labels; give one label to each frame")
+        raise UserError(f"contact sheet: {len(frames)} frames and {len(labels)} labels; give one label for each frame")
     height, width = (max(frame.shape[axis] for frame in frames) for axis in (0, 1))
     rows = -(-len(frames) // columns)
     sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)

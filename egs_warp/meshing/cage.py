@@ -191,8 +191,8 @@ def cage_of_mesh(cloud: GaussianCloud, mesh: TetMesh, solid: LatticeSolid) -> Ca
     enclosed = _enclosed_share(cloud, mesh, np.where(solid.belongs, cloud.opacities(), 0.0), everything)
     if enclosed < _MIN_OWN_ENCLOSED_FRACTION:
         raise UserError(
-            f"cage: the mesh encloses {100.0 * enclosed:.0f} % of the object; give one around it, in the coordinates"
-            " of the capture",
+            f"cage: the mesh encloses {100.0 * enclosed:.0f} % of the object; give a mesh that encloses it, in the"
+            " coordinates of the capture",
             check=("up", "plane"),
         )
     return Cage(

@@ -139,7 +139,9 @@ def pose_photos(
         except RuntimeError as error:
             # COLMAP raises this error if its database fails, for example on a full disk.
             reason = next(iter(str(error).splitlines()), "no reason given")
-            raise UserError(f"pose: COLMAP cannot continue ({reason}); is there free space in {out}?") from error
+            raise UserError(
+                f"pose: COLMAP cannot continue ({reason}); check that there is free space in {out}"
+            ) from error
         _write_model(model, work / "sparse" / "0", out)
         try:
             for part in _WRITES:

@@ -92,7 +92,7 @@ class Shot:
     def __post_init__(self) -> None:
         if self.size is not None and not all(MIN_SIDE <= side <= MAX_SIDE for side in self.size):
             text = "x".join(map(str, self.size))
-            advice = f"give pixels from {MIN_SIDE} to {MAX_SIDE}, such as 512 or 640x360"
+            advice = f"give sides from {MIN_SIDE} to {MAX_SIDE} pixels, such as 512 or 640x360"
             raise ArgumentError("size", advice, value=text)
         if not 1.0 <= self.fps <= MAX_FPS:
             raise ArgumentError("fps", f"give a number of frames per second from 1 to {MAX_FPS:g}", value=self.fps)

@@ -167,7 +167,7 @@ def _sampled(pixels: _Pixels, random: np.random.Generator) -> Plane:
             best, least = plane, cost
     if best is None:
         raise UserError(
-            "plane: the masked points lie on a line or in the line of sight; mark a wider part of the plane"
+            "plane: the masked points lie on a line, or the plane is seen edge-on; mark a wider part of the plane"
         )
     return best
 

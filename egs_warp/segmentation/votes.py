@@ -83,7 +83,10 @@ def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
         raise UserError(f"{masks[0].name}: the mask is empty; mark the object in it")
     votes = blending_votes(cloud, marked)
     if not (votes.inside + votes.outside > 0.0).any():
-        raise UserError("object: the masks' cameras see no part of the capture; check that both share one frame")
+        raise UserError(
+            "object: the masks' cameras see no part of the capture; check that cameras and capture have the same"
+            " coordinate frame"
+        )
     return votes
 
 

@@ -62,7 +62,7 @@ class Checkpoint:
             raise UserError(f"{self.path}: the checkpoint is damaged; start the training again") from error
         if facts.get("digest") != digest:
             raise UserError(
-                f"{self.path}: it belongs to other photos, other flags or another version of egs-warp;"
+                f"{self.path}: it belongs to other photos, other settings or another version of egs-warp;"
                 " start the training again"
             )
         return state

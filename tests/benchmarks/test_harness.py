@@ -79,7 +79,7 @@ def test_benchmark_outputs(harness: ModuleType, tmp_path: Path, capsys: pytest.C
 
 
 def test_picture_of_floats(harness: ModuleType, tmp_path: Path) -> None:
-    """Pixel values are floats from 0 to 1; they are clipped, rounded and written as bytes."""
+    """Pixel values are floats, which are clipped to the range from 0 to 1, rounded and written as bytes."""
     options = harness.flags("What.", quick="less", device="cpu").parse_args(["--plot", str(tmp_path / "p.png")])
     harness.report(options, [], aims={}, picture=np.full((2, 2, 3), [0.5, 1.7, -1.0]))
     with Image.open(tmp_path / "p.png") as picture:
@@ -93,7 +93,7 @@ def test_an_aim_is_judged_or_explained(harness: ModuleType) -> None:
 
 
 def test_data_folder(harness: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The data folder is set by the environment variable; by default it is next to the repository."""
+    """The environment variable sets the data folder, which by default is next to the repository."""
     monkeypatch.setenv("EGS_WARP_DATA", "/elsewhere")
     assert harness.data_folder() == Path("/elsewhere")
     monkeypatch.delenv("EGS_WARP_DATA")
@@ -101,7 +101,7 @@ def test_data_folder(harness: ModuleType, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_calls_take_turns(harness: ModuleType) -> None:
-    """Calls alternate, warm-up calls do not count, and the median is over the others."""
+    """Calls alternate; the median is taken over all calls except those for warming up."""
     order: list[str] = []
     naps = iter([0.5, 0.0, 0.02, 0.02, 0.02])
 

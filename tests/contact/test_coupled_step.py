@@ -50,7 +50,7 @@ def block(
 
 
 def assert_obeys(standing: PassiveBody, before: BodyState, problem: StepProblem, result: CoupledResult) -> None:
-    """Assert that the result satisfies normal complementarity, Coulomb's law, maximal dissipation, and the balances of
+    """Assert that the result satisfies normal complementarity, Coulomb's law, maximal dissipation and the balances of
     linear and angular momentum."""
     body, friction = standing.body, standing.solver.detector.geometry.friction
     contacts, forces = result.contacts, result.forces
@@ -89,7 +89,7 @@ def test_a_block_comes_to_rest_and_every_step_obeys_coulombs_law(push: float) ->
         before = falling.state
         problem, result = falling.advance(DT)
         assert_obeys(falling, before, problem, result)
-    # The base of the pushed block comes to rest while the block still vibrates.
+    # At the end, the base of a pushed block is at rest, although the block still vibrates.
     speed = (result.contacts.jacobian @ result.velocities.ravel()).reshape(-1, 3)
     assert np.abs(speed[:, 1:]).max() < 5e-3 * scale
     if push == 0.0:
@@ -198,7 +198,7 @@ def test_a_sliding_block_stops_and_stays() -> None:
         problem, result = sliding.advance(DT / 2)
         assert_obeys(sliding, before, problem, result)
     way = body.centre_of_mass(sliding.state.positions)[0] - start
-    # Implicit Euler uses the lower speed of each step, so the distance is shorter by v dt / 2.
+    # Implicit Euler uses the lower speed, at the end of each step, so the distance is shorter by v dt / 2.
     assert way == pytest.approx(speed**2 / (2 * friction * 9.81) - 0.25 * speed * DT, rel=0.02)
     assert np.abs(sliding.state.velocities).max() < 1e-2
 
@@ -247,7 +247,7 @@ def test_points_that_would_penetrate_join_the_set() -> None:
 
 
 def test_points_join_before_the_step_without_them_has_converged(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With early activation, the solve ends with the same points in fewer iterations."""
+    """If points are activated early, the solve ends with the same points in fewer iterations."""
     falling = block()
     _, soon = on_one_corner(falling)
     monkeypatch.setattr(coupled_step, "ACTIVATION_RESIDUAL", 0.0)
@@ -326,14 +326,15 @@ def test_predicted_forces_obey_coulombs_law() -> None:
 
 
 def test_a_step_without_new_points_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The gaps at the end of the step are evaluated twice: when the activation threshold is passed, and at the end."""
+    """The gaps at the end of the step are evaluated twice: when the residual falls below the activation threshold, and
+    at the end of the solve."""
     resting = block(sag=0.01, damping_ratio=0.5)
     for _ in range(5):
         resting.advance(DT)
     looks, gaps = [], ContactDetector.gaps
     monkeypatch.setattr(ContactDetector, "gaps", lambda *given: looks.append(1) or gaps(*given))
     _, result = resting.advance(DT)
-    # Two further evaluations belong to point selection and contact set, before the step.
+    # Two further evaluations, before the step, are for the selection of points and for the contact set.
     assert result.converged and result.contacts.count > 4 and len(looks) == 4
 
 

@@ -1,4 +1,4 @@
-"""``egs-warp validate`` and the reader report each problem of a bundle in one line."""
+"""Errors in bundles: ``egs-warp validate`` and the reader report each problem in one line."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.bundles import bundle_bytes, small_bundle, text_of, with_text
 
 
 def _lines(data: bytes, folder: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, list[str]]:
-    """Return the exit status of ``validate`` for a file of these bytes, and the lines that it prints."""
+    """Return the exit status of ``validate`` for a file with these bytes, and the lines that it prints."""
     path = folder / "a.egs"
     path.write_bytes(data)
     status = main(["validate", str(path)])
@@ -165,7 +165,7 @@ def test_all_findings_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[s
     text["frames"] = 131
     text["bodies"][1]["count"] = 6
     status, lines = _lines(with_text(json.dumps(text).encode()), tmp_path, capsys)
-    # One line for the number of frames, and one for each of the six arrays of the static body's splats.
+    # There is one line for the number of frames, and one for each of the six arrays of the static body's splats.
     assert status == 2 and len(lines) == 7
 
 

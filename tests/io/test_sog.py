@@ -1,4 +1,4 @@
-"""SOG, zipped, as a folder and streamed: its variants, and a one-line error for each mistake."""
+"""Variants of SOG: zipped, as a folder and streamed, with a one-line error for each mistake."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_sog_version_1_by_hand(tmp_path: Path) -> None:
         "shN": {"mins": -1.0, "maxs": 1.0, "files": ["c.webp", "l.webp"]},
     }
     (folder / "meta.json").write_text(json.dumps(meta))
-    # A folder that contains only the capture's folder is accepted, too.
+    # A folder whose only content is the folder of the capture is accepted, too.
     for place in (folder, tmp_path):
         capture = read_capture(place, device="cpu")
         cloud = capture.cloud

@@ -1,4 +1,4 @@
-"""The stepper (Eq. 4, 9, 12, 13): an independent audit of each step, deterministic runs, a body that follows its
+"""Stepper (Eq. 4, 9, 12, 13): an independent audit of each step, deterministic runs, a body that follows its
 objectives, and subdivision of a failed step."""
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def test_audit_of_a_hop(device: str) -> None:
     assert len(states) == len(reports) + 1
     for before, report in zip(states[:-1], reports, strict=True):
         after, dt = report.state, report.dt
-        # By hand: forces in world axes at points in world coordinates.
+        # The balances are evaluated explicitly, with forces in world axes at points in world coordinates.
         points = np.einsum("nw,nwi->ni", report.contacts.weights, before.positions[report.contacts.nodes])
         forces = np.einsum("na,nai->ni", report.forces, report.contacts.axes)
         gain = (body.node_mass[:, None] * (after.velocities - before.velocities)).sum(0) / dt
@@ -120,7 +120,8 @@ def test_audit_of_a_hop(device: str) -> None:
         assert 0 < report.qp_count <= stepper.settings.qp_limit
         # Velocities are consistent with the displacements.
         assert np.abs(after.positions - before.positions - dt * after.velocities).max() < 1e-12 * height
-    # The muscles are active: the body went down, then up faster than the push-out of the floor alone could move it.
+    # The body moves down, and then up faster than the push-out of the floor alone could move it, so the muscles are
+    # active.
     speeds = [body.centre_of_mass(s.velocities)[2] for s in states]
     assert min(speeds) < -0.2 and max(speeds) > 0.8
     assert max(np.abs(r.activations / stepper.muscles.bounds).max() for r in reports) > 0.05
@@ -186,7 +187,7 @@ def test_device_factors_give_the_same_hop(device: str, monkeypatch: pytest.Monke
         return made[-1]
 
     monkeypatch.setattr(ElasticAssembly, "new_solver", dense)
-    # The kernels for GPUs also run on a CPU.
+    # The kernels for GPUs are run on a CPU.
     monkeypatch.setattr("egs_warp.fem.elasticity.SimdElasticity", WarpElasticity)
     got, reports = run_hop(muscular_block(device, feet=corners), steps)
     assert len(made) == 2 and len(got) == len(expected) and max(len(one.forces) for one in reports) > 3
@@ -241,7 +242,7 @@ def test_the_stepper_runs_with_every_strategy(strategy: Strategy) -> None:
 
 
 class LateStepper(LocomotionStepper):
-    """Stepper that reports every step longer than ``longest`` as not converged."""
+    """Stepper that reports every step longer than ``longest`` seconds as not converged."""
 
     longest = 0.0
 

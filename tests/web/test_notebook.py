@@ -1,4 +1,4 @@
-"""The widget for notebooks: the data that it holds, and its image in a browser."""
+"""Widget for notebooks: its data, and its image in a browser."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.ipynb"
 _BUILT = pytest.mark.skipif(not PLAYER.is_file(), reason="the player is not built; make web builds it")
 _PAGE = """<!doctype html><html><head><link rel="icon" href="data:,"></head><body>
 <div id="cell" style="width:480px"></div></body></html>"""
-# Like anywidget, the script imports the text of the module and passes bytes as a DataView.
+# As anywidget does, the script imports the text of the module and passes bytes as a DataView.
 _RENDER = """async ([code, bundle, plays]) => {
     const module = await import(URL.createObjectURL(new Blob([code], { type: "text/javascript" })));
     const bytes = Uint8Array.from(atob(bundle), (character) => character.charCodeAt(0));
