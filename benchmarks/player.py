@@ -190,7 +190,7 @@ def _served(folder: Path) -> Iterator[str]:
 
 class _QuietHandler(SimpleHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
-        """Print nothing."""
+        """Suppress the log of requests."""
 
 
 if __name__ == "__main__":

@@ -185,10 +185,9 @@ def gswarp_renderer() -> Renderer:
 def cpu_baselines(scene: Scene, camera: Camera) -> dict[str, dict[str, Any]]:
     """Run each renderer on PyPI that claims CPU support.
 
-    None works. splax 0.2.3 was tried on JAX 0.10.2, which rejects splax's Warp calls on a CPU
-    ("JaxCallableGraphMode.WARP is not supported for JAX CPU FFI calls"). taichi-splatting 0.13 was tried on taichi
-    1.7.4, because the taichi-nightly that it requires is in no index; its import compiles CUDA code ("CUDA_HOME
-    environment variable is not set").
+    None works. JAX 0.10.2 rejects the Warp calls of splax 0.2.3 on a CPU ("JaxCallableGraphMode.WARP is not supported
+    for JAX CPU FFI calls"). The import of taichi-splatting 0.13 compiles CUDA code ("CUDA_HOME environment variable is
+    not set"), here on taichi 1.7.4, because the taichi-nightly that it requires is in no index.
 
     Args:
         scene: Gaussians in the parameters of captures (``ours_scene``).

@@ -34,14 +34,15 @@ CAGE_NODES = {"plant": 2000, "microphone": 500}
 """Number of cage nodes by object, otherwise 1000. The cage must contain the whole mesh, including thin leaves, because
 the deformation is not defined outside the cage."""
 ON_LEGS, ON_LEAVES = (0.15, 0.6, 20.0), (0.3, 0.8, 150.0)
-"""Sag, height (m) and tilt (degrees) of a fall onto the legs and of a fall onto the leaves, which is that of the
-plant."""
+"""Sag, height (m) and tilt (degrees) of a fall onto the legs and of a fall onto the leaves; only the plant falls onto
+its leaves."""
 FLOOR = Plane.from_coefficients(0.0, 0.0, 1.0, 0.0)
 AS_TRAINED, SPLIT, PAPER_SPLIT, AS_MANY = "as trained", "our split", "the paper's split", "trained with as many"
 """Captures: as trained; two splits of the trained capture for the motion; and a capture trained with the mean number of
 Gaussians that our split has over the motions."""
 PAPER_DEGREES = 9.0
-"""The paper's 15 degrees between arms of 3 standard deviations, converted to arms of sqrt 3."""
+"""Maximum bend of the paper, degrees: 15 degrees between arms of 3 standard deviations, converted to arms of sqrt(3)
+standard deviations."""
 
 
 @dataclass(frozen=True)

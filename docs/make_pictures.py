@@ -55,7 +55,7 @@ class Picture:
 
     name: str
     command: str
-    """Command that creates its source; the page shows it."""
+    """Command, shown on a page, that creates the source of the file."""
     source: str
     """Path of the source in ``out``."""
     width: int

@@ -30,7 +30,7 @@ BACKDROP = (0.55, 0.75, 0.55)
 
 
 def eye(degrees: float, elevation: float = 28.0, away: float = 3.2) -> np.ndarray:
-    """(3,) position of a photographer on a circle around the object."""
+    """Return the position (3,) of a photographer on a circle around the object."""
     a, e = np.radians([degrees, elevation])
     return MIDDLE + away * np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
 
@@ -97,7 +97,7 @@ def on_haze(made: Scene, degrees: float = 8.0) -> tuple[GaussianCloud, Plane]:
     leaning = Plane(np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))]), -0.02)
     flat = np.random.default_rng(5).uniform(-2.0, 2.0, (count, 2)) @ np.stack(leaning.tangents())
     white = np.tile(1.4 * (np.arange(bands) == 0)[:, None], (count, 1, 3))
-    # (w, x, y, z) of a rotation about y.
+    # The quaternions (w, x, y, z) are those of a rotation about y.
     half = np.radians(degrees) / 2.0
     haze = GaussianCloud.from_numpy(
         flat - leaning.offset * leaning.normal,

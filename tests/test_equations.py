@@ -1,5 +1,5 @@
-"""Completeness and correctness of ``docs/equations.md``: all names exist, no equation of a docstring is missing, and
-cited tests test their equation.
+"""Completeness and correctness of ``docs/equations.md``: all names exist, no equation that a docstring mentions is
+missing, and cited tests test their equation.
 
 A cited test must mention the equation and call the code of its row. For each equation, ``tests/support/mutations.py``
 has a wrong formula with which one of the row's tests fails (``tests/test_formula_mutations.py``).

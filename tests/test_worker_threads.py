@@ -117,7 +117,7 @@ def test_an_error_is_raised_by_result() -> None:
 
 
 def test_each_of_the_first_tasks_has_a_thread() -> None:
-    """A task starts even if the previous ones, fewer than the limit of threads, are still running."""
+    """A task starts even if previous ones, fewer than the maximum number of threads, are still running."""
     go, begun = threading.Event(), [threading.Event(), threading.Event()]
 
     def long(number: int) -> bool:

@@ -171,7 +171,7 @@ class VideoWriter:
         if frame.shape != self._shape or frame.dtype != np.uint8:
             raise UserError(
                 f"{self._path}: a frame has shape {frame.shape} and type {frame.dtype},"
-                f" expected {self._shape} and uint8"
+                f" expected {self._shape} and uint8; give frames of one shape"
             )
         height, width, _ = self._shape
         if height % 2 or width % 2:

@@ -109,7 +109,7 @@ def read_keyframes(path: Path) -> tuple[Key, ...]:
     """
     path = Path(path)
     if path.suffix.lower() not in (".json", ".csv"):
-        raise UserError(f"{path}: key frames are read from .json or .csv")
+        raise UserError(f"{path}: key frames are read from .json or .csv; give one of these")
     text = read_text(path)
     keys = _from_json(text, path) if path.suffix.lower() == ".json" else _from_csv(text, path)
     if not keys:

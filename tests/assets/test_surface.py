@@ -29,7 +29,7 @@ def test_baked_light_against_closed_forms(device: str) -> None:
 
 
 def test_sh_of_a_highlight() -> None:
-    """Along the lobe, the highlight adds its strength to the colour; from behind it adds almost nothing."""
+    """Seen along the lobe, the highlight adds its strength to the colour; seen from behind, it adds almost nothing."""
     direction = np.array([[0.48, -0.6, 0.64]])
     sh = sh_from_colour(np.full((1, 3), 0.4), direction, np.array([0.2]), lobe_colour=(1.0, 1.0, 1.0))
     from egs_warp.geometry.camera import Camera

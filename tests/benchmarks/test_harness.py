@@ -26,7 +26,7 @@ def harness() -> ModuleType:
 def test_every_benchmark_takes_the_flags(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The script imports, and ``--help`` prints the common flags and its docstring."""
+    """The script can be imported, and ``--help`` prints the common flags and the script's docstring."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     script = module_of(name)
     with pytest.raises(SystemExit) as end:
@@ -39,7 +39,8 @@ def test_every_benchmark_takes_the_flags(
 
 
 def test_there_are_benchmarks() -> None:
-    """The scripts are found by their ``main``; a renamed one must not leave the test above empty."""
+    """The scripts are found by their ``main``. Their number is checked, because a script without ``main`` would be left
+    out of the test above."""
     assert len(SCRIPTS) == 39
 
 

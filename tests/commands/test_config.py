@@ -1,4 +1,5 @@
-"""A run from the configuration file that another run wrote repeats that run; each bad file gives a one-line error."""
+"""Configuration files: a run from the file that another run wrote repeats that run, and each bad file gives a one-line
+error."""
 
 from __future__ import annotations
 

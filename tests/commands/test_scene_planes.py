@@ -53,7 +53,7 @@ def test_up_of_the_file_is_used(comments: list[str], note: str, tmp_path: Path) 
 
 
 def test_a_capture_with_nothing_flat_has_one_plane() -> None:
-    """For isotropic Gaussians on a grid, the given plane is the only one."""
+    """For isotropic Gaussians on a grid, no plane is found besides the given one."""
     x, y = (values.ravel() for values in np.meshgrid(np.linspace(-1.0, 1.0, 40), np.linspace(-1.0, 1.0, 40)))
     means = np.stack([x, y, np.zeros_like(x)], axis=1)
     box = (np.abs(x) < 0.2) & (np.abs(y) < 0.2)

@@ -58,8 +58,8 @@ def contacts_within(detector: ContactDetector, positions: np.ndarray, distance: 
 def test_selection_equals_that_of_one_world_in_every_step(
     points: ContactSelector, detector: ContactDetector, positions: np.ndarray
 ) -> None:
-    """The selection and the points that penetrate during a step are equal in three steps, in which points are added,
-    retained because of their load, and removed."""
+    """The selection and the points that penetrate during a step equal those of single worlds in three steps, in which
+    points are added, retained because of their load, and removed."""
     random = np.random.default_rng(1)
     before = [np.zeros(0, int)] * WORLDS
     loads, joins = [np.zeros(0)] * WORLDS, 0

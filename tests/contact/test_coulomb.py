@@ -73,7 +73,8 @@ def test_sweeps_equal_their_twin(friction: float, sweeps: int) -> None:
 
 @pytest.mark.parametrize("friction", [0.0, 0.4, 1.5])
 def test_solutions_obey_coulombs_law_for_different_tangents(friction: float) -> None:
-    """Eq. (8), (9): complementarity, the cone, and friction opposite to the slip hold to 1e-9 from any start."""
+    """Eq. (8), (9): for any initial forces, complementarity holds to 1e-9, forces are within the friction cone, and
+    friction is opposite to the slip."""
     for seed in range(6):
         delassus, free, shift, start = problem(seed)
         forces, size = coulomb_forces(delassus, free, shift, friction, start)

@@ -162,8 +162,8 @@ def test_block_on_an_incline_sticks_or_slides(degrees: float) -> None:
 
 @pytest.mark.parametrize("degrees", [0.0, 15.0])
 def test_a_resting_body_neither_sinks_nor_creeps(degrees: float) -> None:
-    """Eq. (8), Eq. (9): at rest on level ground and on a slope with enough friction; the contact forces carry the
-    weight."""
+    """Eq. (8), Eq. (9): on level ground, and on a slope with enough friction, the block stays at rest, and the contact
+    forces carry its weight."""
     resting = block(0.5, sag=0.01, damping_ratio=0.5, slope=np.radians(degrees))
     body = resting.body
     for _ in range(200):
@@ -205,7 +205,7 @@ def test_a_sliding_block_stops_and_stays() -> None:
 
 @pytest.mark.parametrize("depth", [0.006, 0.02, 0.3])
 def test_a_penetrating_body_is_pushed_out_to_the_tolerance(depth: float) -> None:
-    """Eq. (8): points deeper than the tolerance rise by a fifth of the excess per step, up to the speed cap; other
+    """Eq. (8): points deeper than the tolerance rise by a fifth of the excess per step, up to the speed limit; other
     points stay at their depth."""
     sunk = block(sag=0.002, lift=-depth)
     height = sunk.body.height
@@ -277,7 +277,7 @@ def test_a_tangent_that_yields_no_descent_is_replaced() -> None:
 
 
 def test_a_linearization_predicts_the_step() -> None:
-    """Eq. (8): contact forces change the velocities by the solution of the tangent for their impulse. Columns that are
+    """Eq. (8): contact forces change the velocities by the inverse of the tangent times their impulse. Columns that are
     passed in again give the same Delassus operator."""
     standing = block()
     x, solver = standing.state.positions @ Rotation.from_rotvec([0.0, 0.1, 0.2]).as_matrix().T, standing.solver

@@ -75,7 +75,7 @@ def test_gaps_kernel_equals_its_twin(device: str) -> None:
 
 def test_gaps_to_a_step_and_a_wall_equal_their_twin(device: str) -> None:
     """Eq. (8): gaps to a floor, a step with two faces, and a wall. A point over the step has its gap to the tread, a
-    point in front of the step has it to the riser."""
+    point in front of the step has its gap to the riser."""
     mesh = block_mesh()
     low = mesh.nodes.min(axis=0)
     size = np.ptp(mesh.nodes, axis=0)
@@ -240,8 +240,8 @@ def assert_coulomb(
 @pytest.mark.parametrize(("count", "unknowns"), [(1, 6), (4, 20), (12, 60), (12, 24), (40, 150), (40, 60)])
 @pytest.mark.parametrize("friction", [0.0, 0.3, 0.8])
 def test_coulomb_forces_on_random_problems(count: int, unknowns: int, friction: float) -> None:
-    """Eq. (8), Eq. (9): complementarity and the exact cone. With fewer unknowns than rows, G is singular; one contact
-    is duplicated."""
+    """Eq. (8), Eq. (9): forces satisfy complementarity and the exact cone, also for a singular G, which has fewer
+    unknowns than rows and a duplicate contact."""
     for seed in range(4):
         rng = np.random.default_rng(seed)
         rows = rng.standard_normal((3 * count, unknowns)) * rng.uniform(0.3, 2.0, unknowns)
@@ -304,8 +304,8 @@ def test_separating_and_absent_contacts_need_no_force() -> None:
 
 @pytest.mark.parametrize("regularisation", [0.0, 1e-7])
 def test_coulomb_forces_of_forty_points_under_a_rigid_base(regularisation: float) -> None:
-    """Eq. (9): a Jacobian of 120 rows with rank 6, for sticking, sliding, spinning and tilting motions of the body. The
-    forces satisfy Coulomb's law and carry the body."""
+    """Eq. (9): for a Jacobian of 120 rows with rank 6 and sticking, sliding, spinning and tilting motions of the body,
+    the forces satisfy Coulomb's law and carry the body."""
     rng = np.random.default_rng(5)
     mass, inertia = 2.0, np.diag([0.3, 0.4, 0.2])
     arms = np.column_stack([rng.uniform(-0.5, 0.5, (40, 2)), np.full(40, -0.5)])

@@ -126,8 +126,8 @@ def test_worlds_are_judged_independently_and_as_on_the_host(device: str) -> None
 
 
 def test_a_line_search_halves_the_step_until_it_fails_twice() -> None:
-    """Without an acceptable point the tangent is updated; the step fails if the tangent was already
-    evaluated at the iterate."""
+    """If no acceptable point is found, the tangent is updated; if the tangent was already evaluated at the iterate, the
+    step fails."""
     progress = after(0.1)
     lengths = [progress.length]
     progress.judge(0.2, 0.0)

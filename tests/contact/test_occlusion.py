@@ -45,5 +45,5 @@ def test_darkening_below_beside_and_above_a_body(soft: bool) -> None:
     np.testing.assert_allclose(sh[:, 1, 0], 0.2 * gains, rtol=1e-5)
     fraction = 0.85 * np.exp(-0.02 / (0.06 * 0.4))
     np.testing.assert_allclose(gains[1:], [1.0 - fraction, 1.0 - 0.5 * fraction, 1.0, 1.0], atol=0.02)
-    # The Gaussian of the first body is 0.03 above the second one, which hides nothing of the sky.
+    # The Gaussian of the first body is 0.03 above the second body, which hides nothing of its sky.
     assert gains[0] == pytest.approx(1.0, abs=1e-3)

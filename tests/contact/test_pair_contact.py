@@ -139,7 +139,7 @@ def test_a_common_rigid_motion_changes_no_gap(
     detector, positions, contacts = deformed
     rotation = Rotation.from_rotvec([0.7, -1.1, 0.4])
     moved = detector.contact_set(contacts.points, rotation.apply(positions) + [3.0, -2.0, 5.0])
-    # The boxes do not rotate, so points near their edges have a tetrahedron in only one of the two.
+    # The boxes do not rotate, so points near their edges have a tetrahedron in only one of the two boxes.
     both = np.isfinite(moved.gaps) & np.isfinite(contacts.gaps) & (contacts.gaps < NEAR)
     same = both & (moved.nodes == contacts.nodes).all(axis=1)
     assert same.sum() > 15 and np.array_equal(same, both)

@@ -116,7 +116,8 @@ WALL = Solid((Plane.from_coefficients(-1.0, 0.0, 0.0, 0.15),))
 
 
 def test_the_kernel_equals_its_twin(device: str) -> None:
-    """Eq. (8): gaps to the nearer of wavy ground and a wall beside it, and contact frames, against plain NumPy."""
+    """Eq. (8): gaps to the nearer one of wavy ground and a wall beside it, and contact frames, compared with plain
+    NumPy."""
     mesh = block_mesh()
     field = wavy_ground(reach=0.3)
     cloud = surface_cloud(mesh, 400, lowest=0.04)

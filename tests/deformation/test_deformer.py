@@ -153,7 +153,7 @@ def tets_of(embedding: GaussianEmbedding) -> np.ndarray:
 
 
 def by_arms(cloud: GaussianCloud, embedding: GaussianEmbedding, positions: np.ndarray) -> np.ndarray:
-    """Return (n, 3, 3) (F+ + F-)/2 of Eq. (14) from the deformed ends of the arms, in float64."""
+    """Return (F+ + F-)/2 (n, 3, 3) of Eq. (14), computed from the deformed ends of the arms in float64."""
     nodes = np.asarray(embedding.points.nodes.numpy(), np.int32)
     weights = np.asarray(embedding.points.weights.numpy(), np.float64)
     ends = np.einsum("pk,pki->pi", weights, positions[nodes]).reshape(-1, 7, 3)
@@ -175,7 +175,8 @@ def test_arms_follow_their_ends(device: str) -> None:
     sigma = gradient @ covariances(cloud) @ gradient.transpose(0, 2, 1)
     shared = (mesh.tets[tets][:, 1:, :, None] == mesh.tets[tets][:, :1, None, :]).any(axis=3).sum(axis=2)
     assert (shared == 4).any() and (shared == 3).any() and (shared < 3).any()
-    # An arm too short for a difference of float32 positions uses the mean of the two deformation gradients instead.
+    # For an arm that is too short for a difference of float32 positions, the mean of the two deformation gradients is
+    # used instead.
     exact = (np.linalg.det(gradient) > 0.05) & ~((shared < 3) & (arms < 2e-3)).any(axis=1)
     assert exact.mean() > 0.9
     error = np.abs(covariances(result) - sigma).max(axis=(1, 2)) / np.abs(sigma).max(axis=(1, 2))
@@ -423,7 +424,7 @@ def test_the_rotation_of_a_rank_one_map_maps_its_line(device: str) -> None:
 
 
 def test_axes_keep_their_order(device: str) -> None:
-    """The best aligned of all six orders of a frame's columns is chosen."""
+    """Of all six orders of a frame's columns, the best aligned one is chosen."""
     count = 200
     frames = turns_of(count, 4)
     carried = np.random.default_rng(10).normal(size=(count, 3, 3))

@@ -57,7 +57,8 @@ def brute_force(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def test_points_are_located_as_by_brute_force(device: str) -> None:
-    """Eq. (2): the containing tetrahedron, or the nearest one by true distance, and its barycentric weights."""
+    """Eq. (2): the containing tetrahedron, or the nearest one by true distance, is found with its barycentric
+    weights."""
     mesh = blob()
     points = np.random.default_rng(1).uniform(-0.6, 1.6, (250, 3))
     points[:20] = np.random.default_rng(2).uniform(0.05, 0.45, (20, 3))

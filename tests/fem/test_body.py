@@ -1,4 +1,4 @@
-"""The soft body: mass, momenta, energy, best-fit rotation, and elasticity and damping from its height."""
+"""Soft body: mass, momenta, energy, best-fit rotation, and elasticity and damping that follow from its height."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def test_the_cache_keeps_the_most_recent_graphs(device: str, monkeypatch: pytest
 
 
 def test_garbage_collection_is_disabled_during_a_capture(device: str) -> None:
-    """Device memory that is freed would synchronise with the device and break the capture."""
+    """Freeing device memory during a capture would synchronise with the device and break the capture."""
     stream, enabled = GraphStream(torch.device(device)), []
     again = stream.run_captured(lambda: enabled.append(gc.isenabled()))
     for _ in range(3):
@@ -108,8 +108,8 @@ def test_garbage_collection_is_disabled_during_a_capture(device: str) -> None:
 
 
 def test_nested_entries_of_a_stream_end_with_the_first(device: str) -> None:
-    """Nested entries, also with another object for the same stream, stay in the context of the first. The context is
-    per thread. Gradients are disabled within, and enabled before and after."""
+    """Nested contexts, also those of another object for the same stream, end with the outermost one. A context belongs
+    to one thread. Gradients are disabled within it, and enabled before and after it."""
     one, other = GraphStream(torch.device(device)), GraphStream(torch.device(device))
     outside = torch.cuda.current_stream() if device != "cpu" else None
     with one:
@@ -126,8 +126,8 @@ def test_nested_entries_of_a_stream_end_with_the_first(device: str) -> None:
 
 
 def test_later_work_follows_all_branches_of_a_fork(device: str) -> None:
-    """Branches start after the work before the fork, run directly and captured. They compute the sums of long rows that
-    this work fills."""
+    """Whether the work is executed directly or captured, branches start after the work before the fork. They compute
+    the sums of long rows that this work fills."""
     stream, count = GraphStream(torch.device(device)), 1 << 20
     upload, rows = PinnedUpload(stream, 1), torch.zeros((4, count), dtype=torch.float64, device=device)
     sums, readback = torch.zeros(4, dtype=torch.float64, device=device), stream.pinned(1)

@@ -30,7 +30,7 @@ def test_nothing_joins_two_slabs(count: int, seed: int) -> None:
     for number, part in enumerate(slabs.parts):
         for other in slabs.parts[number + 1 :]:
             assert not joined[np.ix_(part, other)].any()
-    # Optimal are a quarter of the unknowns per part, and three separators as wide as the band.
+    # The optimum has a quarter of the unknowns in each part, and three separators as wide as the band.
     assert max(map(len, slabs.parts)) + len(slabs.separator) < 0.3 * count + 12
 
 

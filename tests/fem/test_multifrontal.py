@@ -71,7 +71,8 @@ def test_every_pattern_and_number_of_right_sides(name: str) -> None:
 
 
 def strained(factors: LinearSolver, upper: sparse.csc_matrix, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``quadratic_form`` for random input and ``vectors``; the random matrix has the pattern of ``upper``."""
+    """Return the result of ``quadratic_form`` for random input and ``vectors``; the random matrix has the pattern of
+    ``upper``."""
     random = np.random.default_rng(6)
     slope, weights, away = random.standard_normal((3, len(vectors)))
     return factors.quadratic_form(upper.data, slope, weights, vectors, dt_now=0.3, dt_ahead=-0.7, reference=away)
@@ -154,7 +155,7 @@ def test_solvers_with_a_shared_analysis_have_their_own_factors() -> None:
 
 def test_a_negligible_pivot_has_no_factors() -> None:
     """A matrix with a negligible pivot, at the start or in the middle of a block, has no factors; an indefinite matrix
-    does."""
+    has factors."""
     matrix = PATTERNS["full, of fifty"].toarray()
     whole = upper_of(sparse.csc_matrix(matrix))
     factors = MultifrontalLdl(whole)

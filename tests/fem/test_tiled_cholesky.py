@@ -118,7 +118,7 @@ def test_slabs_of_a_long_body_are_factored_at_once(device: str) -> None:
 @pytest.mark.parametrize("diagonal", [30.0, 1.0])
 def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
     """Solutions and quadratic models agree to rounding, with and without a low-rank term; an indefinite matrix has no
-    dense factors, but its sum with a term may have.
+    dense factors, but its sum with a low-rank term may have them.
     """
     upper = pattern(60)
     dense, thin = TiledCholesky(upper, device=device), MultifrontalLdl(upper)

@@ -174,7 +174,7 @@ def _covariances(cloud: GaussianCloud) -> np.ndarray:
 
 
 def _colours(cloud: GaussianCloud, directions: np.ndarray) -> np.ndarray:
-    """Return the colours (n, 3), without the constant, of each Gaussian seen along its own direction (n, 3)."""
+    """Return the colours (n, 3), without the constant term, of each Gaussian seen along its own direction (n, 3)."""
     x, y, z = directions.T
     basis = [np.full(len(x), 0.2820948), -0.4886025 * y, 0.4886025 * z, -0.4886025 * x]
     basis += [1.0925484 * x * y, -1.0925484 * y * z, 0.3153916 * (2 * z * z - x * x - y * y)]

@@ -1,4 +1,4 @@
-"""Outliers among the Gaussians of a capture are left out and reported."""
+"""Outliers among the Gaussians of a capture, which are left out and reported."""
 
 from __future__ import annotations
 

@@ -38,7 +38,8 @@ def test_the_manifest_is_written_last_with_checksums(tmp_path: Path) -> None:
 
 
 def test_initial_files_are_written_before_the_first_file(tmp_path: Path) -> None:
-    """Initial files are written once, after an earlier run is moved aside; a run without files has no initial files."""
+    """Initial files are written once, after an earlier run has been moved aside; a run that writes no file writes no
+    initial files."""
     finished(tmp_path, flags="1")
     begun: list[list[str]] = []
     with run_folder(tmp_path, overwrite=True) as run:

@@ -31,8 +31,9 @@ from egs_warp.pipelines.creature import Creature
 from tests.support.creatures import coarse_pawn, on_its_rim
 
 FRICTIONS = (0.8, 0.4, 0.6)
-"""At 1.2, the plan of a body that is pushed down amplifies rounding: a change of the start by 1e-15 m changes the
-activations of a single stepper by up to 0.09 of their bounds."""
+"""Friction coefficients of the worlds. With a coefficient of 1.2, the plan of a body that is pushed down would amplify
+rounding: a change of the start by 1e-15 m would change the activations of a single stepper by up to 0.09 of their
+bounds."""
 Goals = Callable[[BodyState, StepReport | None, float], Sequence[AnyObjective]]
 """Function of the state, the last report and the step size that returns the objectives of a step, like
 ``Motion.objectives``."""

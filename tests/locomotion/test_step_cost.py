@@ -1,4 +1,4 @@
-"""The quadratic cost of a step (Eq. 13), compared with direct evaluation and finite differences."""
+"""Quadratic cost of a step (Eq. 13), compared with direct evaluation and finite differences."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, tim
 
 
 def test_effort_is_the_future_energy_and_convex() -> None:
-    """Value and gradient of the effort equal those of the energy at the future positions, by finite differences; the
+    """The value and the gradient of the effort equal the energy at the future positions and its finite differences; the
     model is convex and accurate near the predicted end."""
     problem, linear, foreseen = example()
     horizon = 0.16

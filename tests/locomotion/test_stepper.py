@@ -86,8 +86,9 @@ def run_hop(stepper: LocomotionStepper, steps: int) -> tuple[list[BodyState], li
 
 
 def test_audit_of_a_hop(device: str) -> None:
-    """Eq. (4), Eq. (9), Eq. (12), Eq. (13): in units of weight and height, the linear momentum balance holds to 1e-5,
-    the angular one, the friction cone and complementarity hold to 1e-4, and the penetration is at most 0.01.
+    """Eq. (4), Eq. (9), Eq. (12), Eq. (13): in units of weight and height, the balance of linear momentum holds to
+    1e-5, the balance of angular momentum, the friction cone and complementarity hold to 1e-4, and the penetration is at
+    most 0.01.
     """
     stepper = muscular_block(device)
     body = stepper.body
@@ -175,7 +176,8 @@ def test_a_body_bobs_as_requested() -> None:
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 def test_device_factors_give_the_same_hop(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """In 30 planned steps (10 on a CPU, where dense factors are slow), positions differ by less than 1e-8 H from those
-    with sparse factors. The body has four contact points; with more, rounding decides which of them carry the load.
+    with sparse factors. The body has four contact points; with more points, rounding decides which of them carry the
+    load.
     """
     steps, corners = 10 if device == "cpu" else 30, GRID[[0, 4, 20, 24]]
     dense_factors = pytest.importorskip("egs_warp.fem.tiled_cholesky")
@@ -262,7 +264,7 @@ class LateStepper(LocomotionStepper):
 
 @pytest.mark.parametrize(("longest", "parts"), [(1.0, 1), (0.6, 2), (0.3, 4), (0.01, 16)])
 def test_a_step_that_does_not_converge_is_subdivided(longest: float, parts: int) -> None:
-    """The step is halved until it converges, at most four times; the parts add up to the step, use the activations
+    """The step is halved until it converges, at most four times; the parts add up to the step and use the activations
     planned for the whole step, and the last failure stays in the reports."""
     made = muscular_block()
     stepper = LateStepper(made.body, made.muscles, made.geometry, device="cpu")

@@ -1,5 +1,5 @@
-"""Level sets: distances of a box, gradients against finite differences, the fit to outer points of a ball, and the
-surfaces of real captures.
+"""Level sets: distances of a box, gradients compared with finite differences, the fit to outer points of a ball, and
+the surfaces of real captures.
 """
 
 from __future__ import annotations

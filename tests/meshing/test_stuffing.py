@@ -1,4 +1,4 @@
-"""The minimum dihedral angle of isosurface stuffing, by search over all states of a lattice tetrahedron."""
+"""Minimum dihedral angle of isosurface stuffing, found by a search over all states of a lattice tetrahedron."""
 
 from __future__ import annotations
 

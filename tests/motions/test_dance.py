@@ -24,7 +24,7 @@ from tests.support.runs import Run, coarse_block_run
 
 @pytest.fixture(scope="module")
 def danced() -> Run:
-    """Simulate a block that dances to five beats, of which the third comes too soon after the jump to the second."""
+    """Simulate a block that dances to five beats, of which the third comes too soon after the jump on the second."""
     return coarse_block_run("dance 100 0.5 5")
 
 

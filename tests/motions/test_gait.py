@@ -41,7 +41,7 @@ def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
 @given(st.integers(2, 7))
 def test_the_progress_of_the_body_is_that_of_its_feet(feet: int) -> None:
     """Far from both ends of a walk, the progress of the body in the middle of a swing is the mean progress of all
-    groups of feet, averaged over before and after the swing. It increases by one per swing."""
+    groups of feet, averaged over the times before and after the swing. It increases by one per swing."""
     gait = Gait.create(feet, 40, 0.03, LEGGED_TIMING, time_unit=0.3)
     swing, rounds = 20, len(gait.groups)
     before = np.mean([gait.target_step(swing - 1 - k) for k in range(rounds)])

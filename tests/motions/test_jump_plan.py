@@ -101,8 +101,8 @@ def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTa
 @pytest.mark.parametrize("landing_time", [0.02, 0.11, 0.3])
 @pytest.mark.parametrize("fall", [0.5, 2.0])
 def test_feet_stop_a_body_with_a_gradual_landing(landing_time: float, fall: float) -> None:
-    """A linear inverted pendulum comes to rest over its feet; its load is first the one that stops the fall at a
-    constant rate, then its weight. The feet are further ahead than for a fall that stops at once.
+    """A linear inverted pendulum comes to rest over its feet; the load on the feet is first the one that stops the fall
+    at a constant rate, and then the weight. The feet are further ahead than for a fall that stops at once.
     """
     com_height, speed = 0.5, 1.3
     lever = speed * stopping_time(com_height, fall, GRAVITY, landing_time)

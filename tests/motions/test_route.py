@@ -33,8 +33,8 @@ def test_turns_on_the_spot_in_even_paces(angle: float) -> None:
 
 @given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
 def test_a_point_is_reached_in_any_direction(ahead: float, left: float) -> None:
-    """The route ends at the point, and each step except the last one is along the heading. In each step, the length and
-    the turn, as fractions of their limits, add up to at most 1."""
+    """The route ends at the point, and each step except the last one is along the heading. In each of these steps, the
+    length and the turn, as fractions of their limits, add up to at most 1."""
     places = path_route(np.array([[ahead, left]]))(PACE)
     assert places[-1, :2] == pytest.approx([ahead, left], abs=1e-8)
     steps = np.diff(places, axis=0)

@@ -152,8 +152,8 @@ def test_a_body_that_rotates_forward_is_caught_further_ahead(place: Stance) -> N
 
 @pytest.mark.parametrize(("ahead", "urgency"), [(0.0, 0.0), (0.05, 0.25), (-0.1, 0.5), (0.3, 1.5)])
 def test_the_capture_margin_is_relative_to_the_edge(place: Stance, ahead: float, urgency: float) -> None:
-    """The base extends 0.2 m to both sides, and only the speed of the body varies. The margin is the distance of the
-    capture point from the middle, divided by 0.2 m."""
+    """The base extends 0.2 m to both sides, and only the speed of the body varies. Here, the margin is the distance of
+    the capture point from the middle, divided by 0.2 m."""
     pose = BalanceController(place.body, place.ground, place.standing, place.contact_points, place.friction)
     height = place.body.centre_of_mass(place.standing)[2]
     speed = np.array([ahead * np.sqrt(GRAVITY / height), 0.0, 0.0])

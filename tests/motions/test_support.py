@@ -40,8 +40,8 @@ def test_nearest_point_of_a_line() -> None:
 
 
 def test_margins_of_a_triangle() -> None:
-    """The triangle is far from the origin and has a right angle between two legs of 3 m. Its centroid is at (1, 1) from
-    the right angle: 1 m from two edges and sqrt(1/2) m from the third."""
+    """The triangle is far from the origin and has a right angle between two legs of 3 m. Its centroid is at (1, 1) m
+    from the corner with the right angle: 1 m from two edges and sqrt(1/2) m from the third."""
     middle = np.array([101.0, 101.0])
     assert TRIANGLE.middle == pytest.approx(middle)
     assert TRIANGLE.margin(middle) == pytest.approx(np.sqrt(0.5))

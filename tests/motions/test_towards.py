@@ -42,7 +42,7 @@ def test_targets_are_measured_when_the_motion_starts() -> None:
 
 
 def _landing(motion: BodyMotion) -> np.ndarray:
-    """Return the planned displacement (3,) m at touch-down."""
+    """Return the planned displacement (3,), m, at touch-down."""
     planned = [motion.planned_com(time) for time in np.linspace(0.0, motion.expected_time, 200)]
     return [moved for moved in planned if moved is not None and np.isfinite(moved).all()][-1]
 

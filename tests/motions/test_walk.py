@@ -212,7 +212,7 @@ def test_the_planned_pressure_is_under_the_standing_feet(mesh: Callable[[], TetM
         np.concatenate([walk._planner.soles[index, :2] + walk._planner.grips[index] for index in stands])
     )
     assert under.margin(swing) >= -1e-9
-    if len(lifted) == 1:  # the diagonals of the swinging and the standing ones of four feet cross
+    if len(lifted) == 1:  # of four feet, those that swing and those that stand are on crossing diagonals
         other = walk._planner.soles[lifted[0], :2] + walk._planner.grips[lifted[0]]
         assert SupportPolygon.hull(other).margin(swing) < 0.0
     reach = 0.3 + np.ptp(place.standing[:, :2], axis=0)

@@ -46,8 +46,8 @@ def test_columns_make_no_net_force_or_torque(seed: int) -> None:
 
 
 def test_columns_are_equation_7() -> None:
-    """Eq. (7): column j is k_j (B_i^T u - B_k^T u), with u from end i to end k; a segment of zero length exerts no
-    force."""
+    """Eq. (7): column j is k_j (B_i^T u - B_k^T u), with the unit vector u from end i to end k; a segment of zero
+    length exerts no force."""
     rng = np.random.default_rng(1)
     muscles = random_muscles(rng)
     positions = COLUMN.nodes + rng.normal(0.0, 0.05, COLUMN.nodes.shape)

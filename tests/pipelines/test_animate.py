@@ -94,7 +94,7 @@ def test_a_preview_is_small_and_keeps_all_gaussians_for_later(
     preview = replaced(OPTIONS, preview=True)
     report = animate(thing().cloud, tmp_path, plane=thing().plane, options=preview, quiet=True, show_note=notes.append)
     data = RenderData.load(tmp_path / "creature.npz", node_count=len(performance.creature.cage.mesh.nodes))
-    # A deformer of all Gaussians is created only once, for the embedding that the file stores.
+    # A deformer of all Gaussians is created only once, for the embedding that creature.npz stores.
     assert drawn == [data.splats.count, 100] and data.splats.count >= thing().cloud.count
     assert (data.camera.width, data.camera.height) == (24, 24)
     assert notes[-1] == report.notes[-1]

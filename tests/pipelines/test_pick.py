@@ -79,7 +79,8 @@ def test_labels_are_numbers_of_objects_and_the_active_one_has_precedence():
 
 
 def around(point: tuple[float, float, float], *, count: int = 9, span: float = 360.0) -> list[Camera]:
-    """Return ``count`` cameras that look at a point from an arc of ``span`` degrees in front of it and above it."""
+    """Return ``count`` cameras that look at a point from above, on an arc of ``span`` degrees whose middle is in front
+    of the point."""
     angles = np.radians(-90.0 + span * (np.arange(count) / count - 0.5))
     eyes = [np.array(point) + 3.0 * np.array([np.cos(angle), np.sin(angle), 0.5]) for angle in angles]
     return [Camera.look_at(eye, np.array(point), UP, width=80, height=80, vertical_fov_degrees=30.0) for eye in eyes]

@@ -1,4 +1,4 @@
-"""The skinned mesh of a run, evaluated by the rules of glTF 2.0."""
+"""Skinned mesh of a run, evaluated by the rules of glTF 2.0."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def test_command_writes_capture_report_and_sheet(tmp_path: Path, capsys: pytest.
     report = json.loads((out.parent / "ball.report.json").read_text())
     assert report["gaussians"] == capture.count <= 300
     assert report["iterations"] == 60 and report["photos"] == 9 and report["photo_size"] == [32, 32]
-    # Every eighth photo is held out, which are numbers 0 and 8.
+    # Every eighth photo, here numbers 0 and 8, is held out.
     assert [score["name"] for score in report["scores"] if score["held_out"]] == ["r_0.png", "r_8.png"]
     held_out = [score["psnr"] for score in report["scores"] if score["held_out"]]
     assert report["mean"]["held_out"]["psnr"] == pytest.approx(np.mean(held_out))

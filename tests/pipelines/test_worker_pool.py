@@ -1,5 +1,4 @@
-"""Tasks in worker processes, and on Ray if it is installed, of which lost ones are repeated and finished ones are
-not."""
+"""Tasks in worker processes, and on Ray if it is installed: lost tasks are repeated, finished ones are not."""
 
 from __future__ import annotations
 

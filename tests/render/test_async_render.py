@@ -1,4 +1,4 @@
-"""Asynchronous rendering."""
+"""Asynchronous rendering, compared with blocking renders."""
 
 from __future__ import annotations
 

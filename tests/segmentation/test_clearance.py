@@ -279,8 +279,8 @@ def test_foot_cameras_are_low_and_centred_on_the_foot() -> None:
 
 @pytest.mark.parametrize("above", [True, False])
 def test_a_camera_below_the_plane_ignores_what_it_sees_through_it(above: bool) -> None:
-    """For a camera above the plane, all pixels of a ball over the floor have weight; for a camera below, only empty
-    pixels have."""
+    """For a camera above the plane, all pixels of a ball over the floor have weight; for a camera below the plane, only
+    empty pixels have weight."""
     pytest.importorskip("torch")
     ball = round_ones(shell() + [0.0, 0.0, 0.2], 0.04)
     eye = np.array([2.0, 0.0, 2.0 if above else -2.0])

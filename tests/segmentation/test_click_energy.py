@@ -1,4 +1,4 @@
-"""The energy of clicks on four supervoxels without links."""
+"""Energy of clicks on four supervoxels without links."""
 
 from __future__ import annotations
 

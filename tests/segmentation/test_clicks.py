@@ -252,8 +252,8 @@ def test_clicks_as_the_user_writes_them(tmp_path: Path) -> None:
 
 
 def test_a_negative_click_on_a_shadow_keeps_the_foot() -> None:
-    """A tongue of floor, 0.05 high, is connected to the ball's foot: a click on its tip removes its outer half and
-    keeps the ball, although the positive click is as far from the foot.
+    """A tongue of floor, 0.05 high, is connected to the ball's foot. A negative click on the tip of the tongue removes
+    its outer half and keeps the ball, although the positive click is as far from the foot.
     """
     across, out = np.meshgrid(np.linspace(-0.12, 0.12, 9), np.linspace(-0.72, -0.2, 19))
     tongue = [np.column_stack([across.ravel(), out.ravel(), np.full(across.size, z)]) for z in (0.03, 0.05)]

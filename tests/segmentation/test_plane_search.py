@@ -46,8 +46,8 @@ def test_several_planes_widest_first() -> None:
 
 
 def test_gaussians_parallel_to_a_plane() -> None:
-    """Discs count as parallel if they are tilted by less than 25 degrees, and not if by more than 40, whichever axis is
-    thin. Needles and balls do not count.
+    """Discs count as parallel if they are tilted by less than 25 degrees, but not if they are tilted by more than 40,
+    whichever axis is thin. Needles and balls do not count.
     """
     count = 200
     turns = Rotation.from_quat(np.random.default_rng(0).normal(size=(count, 4)))
@@ -82,8 +82,8 @@ def test_a_plane_is_a_single_patch() -> None:
 
 @pytest.mark.parametrize("scale", [1.0, 10.0])
 def test_further_planes_are_level_in_one_patch_and_elsewhere(scale: float) -> None:
-    """In a scene with a table, a floor below it and separate shelves at one level, the further plane is the floor, in
-    any unit of length."""
+    """In a scene with a table, a floor below it and separate shelves at one level, the further plane that is found is
+    the floor, in any unit of length."""
     table, floor = level((-0.6, -0.6), (0.6, 0.6), 0.0, 0.03), level((-2.0, -2.0), (2.0, 2.0), -0.8, 0.03)
     shelves = [level((x, y), (x + 0.7, y + 0.7), 0.7, 0.03) for x in (-2.0, 1.3) for y in (-2.0, 1.3)]
     room = lying(np.concatenate([table, floor, *shelves])).scaled(scale)

@@ -51,7 +51,7 @@ class SteppedSession:
             self._hear()
 
     def until(self, condition: Callable[[], bool], *, max_steps: int = 400) -> int:
-        """Step until ``condition`` holds; return the number of steps."""
+        """Step until ``condition`` returns True; return the number of steps."""
         for count in range(max_steps):
             if condition():
                 return count

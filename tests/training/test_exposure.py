@@ -78,8 +78,8 @@ def test_growth_ends_without_benefit_and_reaches_a_requested_cap() -> None:
 
 
 def test_regularization_and_jitter_equal_their_formulas() -> None:
-    """The regularisation adds the derivatives of mean opacity and scale; the jitter of a faint Gaussian is proportional
-    to Sigma times a normal deviate."""
+    """The regularisation adds the derivatives of the mean opacity and the mean scale to the gradients; the jitter of a
+    faint Gaussian is proportional to Sigma times a normal deviate."""
     count = 4000
     values = {
         "means": torch.zeros(count, 3),

@@ -143,7 +143,8 @@ def test_ssim_equals_scikit_images() -> None:
 
 
 def test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared() -> None:
-    """Kheradmand et al. 2024: the means move by 5e5 rate sigmoid(-100 (o - 0.005)) Sigma times a normal deviate."""
+    """As in Kheradmand et al. 2024, the means move by 5e5 rate sigmoid(-100 (o - 0.005)) Sigma times a normal
+    deviate."""
     count, rate, scales, turn = 40_000, 1e-7, np.array([0.8, 0.3, 0.1]), np.array([0.7, 0.2, -0.5, 0.4])
     opacities = np.array([0.001, 0.005, 0.02])
     tensors = {

@@ -94,7 +94,7 @@ def test_the_module_draws_the_creature_in_a_cell(creature: egs.Creature, chromiu
         )
         drawn = np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB"), float)
         own = _picture_of(widget).astype(float)
-        # The wood is warm, the floor is grey.
+        # The body is found by its colour, because the wood is reddish and the floor is grey.
         body = own[..., 0] - own[..., 2] > 30.0
         assert 0.03 < body.mean() < 0.3 and drawn.shape == own.shape
         assert np.abs(drawn - own)[body].mean() < 4.0 < np.abs(drawn[::-1] - own)[body].mean()

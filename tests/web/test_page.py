@@ -303,7 +303,7 @@ def test_the_floor_is_like_that_of_a_film(chromium: Any, file: str, recording: R
     )
     film = studio_floor(ground, cell=0.25 * height, shadow=False).background(splats).numpy()
     difference = np.abs(_picture(page) - film).max(axis=-1)
-    # The page draws a shadow under the body, and the edges of lines differ slightly.
+    # Some pixels may differ, because the page draws a shadow under the body and edges of lines differ slightly.
     assert np.quantile(difference, 0.75) < 0.008
     assert len(np.unique(np.rint(255.0 * film).astype(int).reshape(-1, 3), axis=0)) > 20
     assert complaints == []
@@ -377,7 +377,7 @@ def test_a_foot_is_bright_while_the_ground_bears_it(chromium: Any, file: str):
         shown = np.abs(picture - np.array(_BACKGROUND)).max(axis=-1) > 0.05
         assert shown.mean() > 2e-3
         green[carried] = float((picture[..., 1] - picture[..., 2])[shown].mean())
-    # Mint is green, the grey is bluish.
+    # Feet with contacts are mint, which is greenish; feet without are bluish grey.
     assert green[True] > 0.01 and green[False] < -0.01
     assert complaints == []
     page.close()

@@ -1,4 +1,4 @@
-"""A live session: its thread, and its reaction to messages."""
+"""Live session: its thread, and its reaction to messages."""
 
 from __future__ import annotations
 

@@ -132,7 +132,7 @@ def test_navigation_without_progress_is_abandoned():
 
 
 def test_a_body_with_feet_walks_there():
-    """The body walks directly towards the point, ahead and sideways; a single walk has a limited length."""
+    """The body walks straight to the point, ahead and sideways at once; a single walk has a limited length."""
     place = coarse_creature(
         stool(), forward=np.array([0.9, 0.3, 0.0]), sag=0.01, strength=20.0, settle_first=False
     ).place

@@ -113,7 +113,7 @@ def test_contact_under_given_activations_obeys_every_pair() -> None:
 
 
 def degenerate_frames() -> dict[str, np.ndarray]:
-    """Contact Jacobians (3n, 6) of points under a rigid body."""
+    """Return contact Jacobians (3n, 6) of points under a rigid body, by name."""
     rng = np.random.default_rng(0)
     points = {
         "line": np.column_stack([np.linspace(-0.5, 0.5, 8), np.zeros(8)]),
@@ -125,8 +125,8 @@ def degenerate_frames() -> dict[str, np.ndarray]:
     frames = {}
     for name, places in points.items():
         arms = np.column_stack([places, np.full(len(places), -0.5)])
-        # Rows with the normal first: velocity of each point along z, x, y for the body's (v_z, v_x, v_y, w_x, w_y,
-        # w_z).
+        # The rows, normal first, give the velocity of each point along z, x, y from the body's velocities (v_z, v_x,
+        # v_y, w_x, w_y, w_z).
         linear = np.tile(np.eye(3), (len(arms), 1))
         turn = np.concatenate([np.cross(np.eye(3), arm).T[[2, 0, 1]] for arm in arms])
         frames[name] = np.hstack([linear, turn])
@@ -149,7 +149,7 @@ def test_degenerate_contact_sets_have_a_solution(name: str, solver: QpSolver) ->
 
 
 def test_states_that_contradict_each_other_are_replaced() -> None:
-    """Contacts at the same point of a rigid body with different gaps cannot all stick: the search starts from the
+    """Contacts at the same point of a rigid body with different gaps cannot all stick, so the search starts from the
     solution of the contact problem instead.
     """
     frame = degenerate_frames()["same"]
