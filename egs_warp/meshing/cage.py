@@ -138,7 +138,7 @@ def cage_of_body(
         UserError: the object has no volume (it is flat or tiny, or nothing opaque lies above the plane).
     """
     if not MIN_NODES <= target_nodes <= MAX_NODES:
-        raise UserError(f"cage: {target_nodes} nodes; give a number from {MIN_NODES} to {MAX_NODES}")
+        raise UserError(f"cage: {target_nodes} nodes are requested; give a number from {MIN_NODES} to {MAX_NODES}")
     solid = solid or solid_from_gaussians(cloud)
     _check_thickness(solid)
     weights = np.where(solid.belongs, cloud.opacities(), 0.0)

@@ -113,7 +113,7 @@ def read_keyframes(path: Path) -> tuple[Key, ...]:
     text = read_text(path)
     keys = _from_json(text, path) if path.suffix.lower() == ".json" else _from_csv(text, path)
     if not keys:
-        raise UserError(f"{path}: no key frames; give at least one")
+        raise UserError(f"{path}: it has no key frames; give at least one")
     channels(keys)
     return tuple(keys)
 
@@ -125,7 +125,7 @@ def checked_keys(keys: Sequence[Key]) -> tuple[Key, ...]:
         UserError: for the first malformed key, by its number.
     """
     if not keys:
-        raise UserError("keys: no key frames; give at least one")
+        raise UserError("keys: the list is empty; give at least one key frame")
     checked = []
     for number, key in enumerate(keys, start=1):
         quantity = key.quantity.value if isinstance(key.quantity, Quantity) else key.quantity

@@ -126,5 +126,5 @@ def read_path(path: Path) -> np.ndarray:
             raise UserError(f"{path}, line {number}: the path jumps by {gap:.3g} body heights; {advice}")
         points.append(point)
     if not points:
-        raise UserError(f"{path}: no points; give lines of two numbers, ahead and left in body heights")
+        raise UserError(f"{path}: it has no points; give lines of two numbers, ahead and left in body heights")
     return np.array(points)

@@ -131,7 +131,7 @@ def pose_photos(
             say(f"left out {reason}")
         names = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
         if len(names) < _MIN_PHOTOS:
-            raise UserError(f"{source}: {len(names)} readable photos; give at least {_MIN_PHOTOS}")
+            raise UserError(f"{source}: only {len(names)} readable photos were found; give at least {_MIN_PHOTOS}")
         try:
             model = _reconstructed(
                 pycolmap, work, names, in_order=is_video, max_side=max_side, seed=seed, say=say, report=report

@@ -51,7 +51,7 @@ class Checkpoint:
         if not self._resume:
             return None
         if not self.path.is_file():
-            raise UserError(f"{self.path}: no checkpoint of an interrupted training here; start without resuming")
+            raise UserError(f"{self.path}: there is no checkpoint of an interrupted training; start without resuming")
         try:
             state: State = dict(read_npz(self.path))
             facts = json.loads(str(state.pop("facts")))

@@ -61,7 +61,10 @@ def test_motions_are_given_by_name_or_to_all_creatures() -> None:
             ["--object", "a=0,0,0.5", "--motion", "b: jump"],
             "--motion 'b: jump': it does not begin with the name",
         ),
-        (["--object", "a=0,0,0.5", "--object", "b=nothing.png"], "b: --object nothing.png: neither a file nor numbers"),
+        (
+            ["--object", "a=0,0,0.5", "--object", "b=nothing.png"],
+            "b: --object nothing.png: this is neither a file nor numbers",
+        ),
         (["--object", "a=0,0,0.5", "--collision-mesh", "no.glb"], "no.glb: no such file"),
     ],
 )

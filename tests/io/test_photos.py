@@ -53,7 +53,9 @@ def test_pixels_are_turned_only_where_that_fits_the_camera(turn: int, tmp_path: 
 
 def test_a_photo_of_another_shape_is_refused_and_one_of_another_size_scaled(tmp_path: Path) -> None:
     path = saved(tmp_path / "a.png", PICTURE)
-    with pytest.raises(UserError, match=r"a.png: 60 x 40 pixels, but its camera has 40 x 60; use the photos that"):
+    with pytest.raises(
+        UserError, match=r"a.png: the photo has 60 x 40 pixels, but its camera has 40 x 60; use the photos that"
+    ):
         read_photo(PosedImage("a.png", camera(40, 60), path))
     photo = read_photo(PosedImage("a.png", camera(240, 160), path))
     assert (photo.camera.width, photo.camera.height, photo.camera.fx) == (60, 40, 12.5)

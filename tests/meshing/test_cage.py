@@ -228,7 +228,7 @@ def test_target_nodes() -> None:
     thing, _ = _pawn_cage(6000)
     cage = build_cage(thing.cloud, thing.plane, target_nodes=1200)
     assert len(cage.mesh.nodes) == pytest.approx(1200, rel=0.15)
-    with pytest.raises(UserError, match="cage: 3 nodes; give a number from 50 to 20000"):
+    with pytest.raises(UserError, match="cage: 3 nodes are requested; give a number from 50 to 20000"):
         build_cage(thing.cloud, thing.plane, target_nodes=3)
 
 

@@ -76,7 +76,7 @@ def test_problems_are_one_line(tmp_path: Path) -> None:
     path.write_text("MeshVersionFormatted 2\nDimension 3\nVertices\n9\n0 0")
     assert "cannot be read as a mesh" in refusal(path)
     meshio.Mesh(mesh.nodes, [("triangle", mesh.boundary_faces())]).write(path)
-    assert "0 nodes in tetrahedra; give a mesh with 50" in refusal(path)
+    assert "its tetrahedra have 0 nodes; give a mesh with 50" in refusal(path)
     moved = mesh.nodes.copy()
     inner = int(np.argmin(np.linalg.norm(moved - moved.mean(axis=0), axis=1)))
     moved[inner] += [3.0, 0.0, 0.0]

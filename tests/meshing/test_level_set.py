@@ -98,7 +98,7 @@ def test_parts_thinner_than_two_cells_are_reported() -> None:
 
 def test_invalid_surfaces_are_refused() -> None:
     mesh = box_mesh((1, 1, 1), (1.0, 1.0, 1.0))
-    with pytest.raises(UserError, match="7 cells; give a number from 64 to 96"):
+    with pytest.raises(UserError, match="7 cells are requested; give a number from 64 to 96"):
         level_set_of_surface(mesh.nodes, mesh.boundary_faces(), cells=7)
     with pytest.raises(UserError, match="no extent"):
         level_set_of_surface(0.0 * mesh.nodes, mesh.boundary_faces())

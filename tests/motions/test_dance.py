@@ -150,13 +150,13 @@ def test_beats_are_read_from_the_first_column(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "beats.csv: no beats; give one time in seconds per line"),
-        ("time\n", "beats.csv: no beats; give one time in seconds per line"),
+        ("", "beats.csv: it has no beats; give one time in seconds per line"),
+        ("time\n", "beats.csv: it has no beats; give one time in seconds per line"),
         ("1\nsoon\n", "beats.csv, line 2: 'soon': give the time of a beat in seconds, from 0 to 600"),
         ("-1\n", "line 1: '-1': give the time of a beat in seconds, from 0 to 600"),
         ("1\ninf\n", "line 2: 'inf': give the time of a beat in seconds, from 0 to 600"),
         ("1\n1\n", "line 2: '1': is not after the previous beat, 1; give beats in increasing order"),
-        ("\n".join(str(k / 10) for k in range(1001)), "1001 beats; at most 1000 are allowed"),
+        ("\n".join(str(k / 10) for k in range(1001)), "it has 1001 beats; give at most 1000"),
     ],
 )
 def test_a_bad_file_of_beats_is_a_one_line_error(tmp_path: Path, text: str, said: str) -> None:

@@ -42,7 +42,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
     assert "neither a folder of photos nor a video" in fails(capsys, str(tmp_path / "no"), "--out", str(out))
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"no photo")
-    assert "0 readable photos; give at least 3" in fails(capsys, str(tmp_path / "photos"), "--out", str(out))
+    assert "only 0 readable photos were found; give at least 3" in fails(
+        capsys, str(tmp_path / "photos"), "--out", str(out)
+    )
     assert not list(out.iterdir())
     for number in range(3):
         Image.new("RGB", (64, 48), (0, 0, 90 * number)).save(tmp_path / "photos" / f"{number}.png")

@@ -94,7 +94,7 @@ def test_unusable_photos_are_named_and_left_out(tmp_path: Path, capsys: pytest.C
     error = capsys.readouterr().err
     assert "left out r_5.png: r_5.png: the photo is not beside the poses; put it there" in error
     assert "r_3.png: the picture is cut short; copy it again" in error
-    assert "r_6.png: 20 x 32 pixels, but its camera has 32 x 32" in error
+    assert "r_6.png: the photo has 20 x 32 pixels, but its camera has 32 x 32" in error
     report = json.loads((tmp_path / "ball.report.json").read_text())
     assert [one["name"] for one in report["left_out"]] == ["r_3.png", "r_5.png", "r_6.png"]
     assert report["photos"] == 6
@@ -188,7 +188,7 @@ def test_masks_beside_the_photos_remove_the_background(tmp_path: Path) -> None:
     cv2.imwrite(str(masks / "r_4.png.png"), half[:8])
     (left,) = read_views(posed).left_out
     assert left.name == "r_4.png"
-    assert "r_4.png.png: 32 x 8 pixels, but its photo has 32 x 32; make the mask" in left.reason
+    assert "r_4.png.png: the mask has 32 x 8 pixels, but its photo has 32 x 32; make the mask" in left.reason
 
 
 def test_the_centre_is_where_the_cameras_point() -> None:

@@ -243,7 +243,7 @@ def test_clicks_as_the_user_writes_them(tmp_path: Path) -> None:
         (["+1,1@b"], r"object \+1,1@b: no Gaussian is visible at this pixel"),
         (["+64,1@b"], "outside of the 64 x 64 pixels of the view"),
         (["+1.2.3,1@b"], r"1\.2\.3,1 is not a pixel"),
-        (["0,0,1", "0,0,2"], "object: 2 objects, 0,0,1 and others; give one, and correct it with clicks"),
+        (["0,0,1", "0,0,2"], "object: 2 objects are given, 0,0,1 and others; give one, and correct it with clicks"),
     ):
         with pytest.raises(UserError, match=message):
             read_object(texts, cloud, posed)

@@ -100,7 +100,7 @@ def test_runs_that_cannot_be_resumed_are_reported(views: list[TrainingView], tmp
             finetune(start(), views, options=OPTIONS, checkpoint=path, resume=True)
         return str(error.value)
 
-    assert error_of(views) == f"{path}: no checkpoint of an interrupted training here; start without resuming"
+    assert error_of(views) == f"{path}: there is no checkpoint of an interrupted training; start without resuming"
     cut_off(views, path, 3, resume=False)
     assert error_of(views[:9]) == (
         f"{path}: it belongs to other photos, other settings or another version of egs-warp; start the training again"
