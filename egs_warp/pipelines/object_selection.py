@@ -158,7 +158,7 @@ def _parse_location(
     except ValueError:
         raise UserError(f"{names.object} {text}: this is neither a file nor numbers; {names.help}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
-        raise UserError(f"{names.object} {text}: {len(numbers)} numbers; {names.help}")
+        raise UserError(f"{names.object} {text}: these are {len(numbers)} numbers; {names.help}")
     if np.abs(numbers).max() > MAX_COORDINATE:
         raise UserError(f"{names.object} {text}: further than {MAX_COORDINATE:g} units from the origin; {names.help}")
     if len(numbers) == 3:

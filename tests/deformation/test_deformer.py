@@ -424,7 +424,7 @@ def test_the_rotation_of_a_rank_one_map_maps_its_line(device: str) -> None:
 
 
 def test_axes_keep_their_order(device: str) -> None:
-    """Of all six orders of a frame's columns, the best aligned one is chosen."""
+    """The best aligned one of all six orders of a frame's columns is chosen."""
     count = 200
     frames = turns_of(count, 4)
     carried = np.random.default_rng(10).normal(size=(count, 3, 3))

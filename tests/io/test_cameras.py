@@ -250,8 +250,8 @@ def message(path: Path) -> str:
 def test_missing_or_unreadable(tmp_path: Path) -> None:
     assert message(tmp_path / "a.json") == ": no such file or folder; check the path"
     assert message(tmp_path) == (
-        ": it contains no camera poses; give a COLMAP model, a cameras.json, a transforms.json, RealityScan's camera parameters"
-        " (.csv) or Metashape's cameras (.xml)"
+        ": it contains no camera poses; give a COLMAP model, a cameras.json, a transforms.json, RealityScan's camera"
+        " parameters (.csv) or Metashape's cameras (.xml)"
     )
     for text, expected in (
         ("[", ": not readable JSON at line 1 (Expecting value); give a cameras.json or a transforms.json"),
