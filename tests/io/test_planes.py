@@ -58,7 +58,7 @@ def test_new_values_replace_the_known_ones() -> None:
             "its ground is damaged; write the file again with egs-warp segment",
         ),
         ({"noise": "low"}, "the properties of plane 0 are damaged; make it again"),
-        ({"offset": 1e300}, "plane 0 lies 1e+300 units from the origin, the limit is 1e+12; make it"),
+        ({"offset": 1e300}, "plane 0 lies 1e+300 units from the origin, the limit is 1e+12; make it again"),
         ({"centre": [1.0]}, "the properties of plane 0 are damaged; make it again"),
     ],
 )
