@@ -175,7 +175,9 @@ def search_pyramid(
     """Find activations and contact forces of a step with the search ``kind``.
 
     Args:
-        program: the QP of the step. kind: search to run. predicted: predicted contact, from which the search starts.
+        program: the QP of the step.
+        kind: search to run.
+        predicted: predicted contact, from which the search starts.
         directions: number of edges of the friction pyramid.
         qp_limit: maximum number of QPs; a search may use ``RESTART_BUDGET`` times as many.
         solver: QP solver, see ``quadratic_program``.
