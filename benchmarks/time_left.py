@@ -1,9 +1,8 @@
 """Accuracy of the remaining time that the progress bars of scene preparation and of simulations show.
 
 The built-in pawn, and koala and fox if the data folder contains them, are separated from their scenes. The pawn jumps,
-hops, twists and walks. At each update of the bar, the
-displayed remaining time is compared with the true remaining time, if that is at least 5 s, because the bar shows whole
-seconds.
+hops, twists and walks. At each update of the bar, the displayed remaining time is compared with the true remaining
+time, if that is at least 5 s, because the bar shows whole seconds.
 
 python benchmarks/time_left.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
 """

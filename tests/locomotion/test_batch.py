@@ -138,8 +138,8 @@ def parts(creature: Creature) -> tuple[SoftBody, MuscleSet, ContactGeometry]:
 
 def rough(creature: Creature) -> tuple[list[BodyState], np.ndarray, float]:
     """Return start states, activations (2, 3, M), m, and the step size, s, of three worlds. The bodies of the first and
-    the last one hit the ground with random muscle activations; the middle one stands. The step size is
-    four times the usual one, so that steps are halved."""
+    the last one hit the ground with random muscle activations; the middle one stands. The step size is four times the
+    usual one, so that steps are halved."""
     body, down = creature.body, creature.body.gravity / np.linalg.norm(creature.body.gravity)
     dt = 4.0 * solver_steps(body)[0]
     starts = [
