@@ -66,7 +66,8 @@ def write_cage(path: Path, root: bpy.types.Object, performance: Performance) -> 
         raise ValueError(_NO_REST_OBJECTS)
     cages = _rest_objects(root, "MESH")
     if len(cages) != 1:
-        raise ValueError(f'the collection "{root.name} {_SUFFIX}" has {len(cages)} meshes; leave the cage there alone')
+        name = f"{root.name} {_SUFFIX}"
+        raise ValueError(f'the collection "{name}" has {len(cages)} meshes; it must contain exactly one, the cage')
     points = np.array([vertex.co for vertex in cages[0].data.vertices], float).reshape(-1, 3)
     if len(points) != len(muscles.rest_nodes):
         raise ValueError(

@@ -65,7 +65,7 @@ def decode_glb(data: bytes, source: Path) -> RawCapture:
         place += 8 + size
     text = chunks.get(JSON_CHUNK, b"")
     if not text or len(text) > MAX_TEXT_BYTES:
-        raise UserError(f"{source}: .glb without a JSON chunk of at most {MAX_TEXT_BYTES} bytes; export it again")
+        raise UserError(f"{source}: the .glb has no JSON chunk of at most {MAX_TEXT_BYTES} bytes; export it again")
 
     def read(number: int, uri: str | None) -> bytes | None:
         if uri is None:
@@ -150,7 +150,9 @@ class _Asset:
         splats = [[p for p in mesh["primitives"] if _is_splats(p)] for mesh in meshes]
         if not any(splats):
             kind = f", only {len(meshes)} mesh{'es' * (len(meshes) > 1)}" if meshes else ""
-            raise UserError(f"{self.source}: glTF without splats ({EXTENSION}){kind}; export it as splats, or as .ply")
+            raise UserError(
+                f"{self.source}: the glTF has no splats ({EXTENSION}){kind}; export it as splats, or as .ply"
+            )
         placed = placements(self.tree, self.source, self._accessor, lambda mesh: bool(splats[mesh]))
         parts = {mesh: [self._primitive(p) for p in splats[mesh]] for mesh in {one.mesh for one in placed}}
         left_out = sum(1 for mesh, found in enumerate(splats) if found and mesh not in parts)

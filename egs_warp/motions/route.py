@@ -119,7 +119,9 @@ def read_path(path: Path) -> np.ndarray:
                 continue  # header line
             point = []
         if len(point) != 2 or not np.all(np.isfinite(point)):
-            raise UserError(f"{path}, line {number}: {line.strip()[:60]!r}: give two numbers, ahead and left")
+            raise UserError(
+                f"{path}, line {number}: {line.strip()[:60]!r}: give two numbers, ahead and left in body heights"
+            )
         gap = float(np.linalg.norm(np.subtract(point, points[-1] if points else (0.0, 0.0))))
         if gap > _MAX_GAP:
             advice = f"give points at most {_MAX_GAP:g} apart, the first at most that far from the start 0,0"

@@ -245,8 +245,8 @@ def _read_masks(
         # Check the size before decoding, because a small file can contain a very large image.
         if size != (camera.width, camera.height):
             raise UserError(
-                f"{file}: the mask is {size[0]} x {size[1]} pixels, the photo {one.name} "
-                f"{camera.width} x {camera.height}; give a mask of the photo's size"
+                f"{file}: the mask has {size[0]} x {size[1]} pixels, but the photo {one.name} has {camera.width} x"
+                f" {camera.height}; give a mask of the photo's size"
             )
         mask = read_mask(file)
         if one.lens is not None:

@@ -282,7 +282,7 @@ def _key(path: Path, number: int, entry: Any) -> list[float]:
     except (TypeError, KeyError, ValueError, AttributeError):
         row = []
     if len(row) != 8 or not np.isfinite(row).all() or max(map(abs, row)) > 1e12:
-        raise UserError(f"{path}: key {number} needs time, eye [x, y, z] and target [x, y, z], finite; correct it")
+        raise UserError(f"{path}: key {number} needs a finite time, eye [x, y, z] and target [x, y, z]; correct it")
     if not 1.0 <= row[7] <= 150.0:
         raise UserError(f"{path}: fov of key {number} is {row[7]:g}; give degrees from 1 to 150")
     return row

@@ -124,8 +124,8 @@ def _gather(views: Sequence[PlaneView], random: np.random.Generator) -> _Pixels:
         for name, values in (("depth", view.depth), ("mask", view.mask)):
             if np.shape(values) != shape:
                 raise UserError(
-                    f"plane: {name} of view {number} is {np.shape(values)[::-1]} pixels, its camera's picture"
-                    f" {shape[::-1]}; resize it to match"
+                    f"plane: {name} of view {number} has {np.shape(values)[::-1]} pixels, but the picture of its camera"
+                    f" has {shape[::-1]}; resize it"
                 )
         valid = view.mask & (view.depth > 0.0) & np.isfinite(view.depth)
         chosen = np.flatnonzero(valid)

@@ -95,8 +95,8 @@ def check_size(view: MaskedView) -> None:
     height, width = view.camera.height, view.camera.width
     if view.mask.shape != (height, width):
         raise UserError(
-            f"{view.name}: the mask is {view.mask.shape[1]} x {view.mask.shape[0]} pixels, its camera {width} x"
-            f" {height}; give a mask of the photo's size"
+            f"{view.name}: the mask has {view.mask.shape[1]} x {view.mask.shape[0]} pixels, but its camera has"
+            f" {width} x {height}; give a mask of the photo's size"
         )
 
 

@@ -133,10 +133,10 @@ def test_damaged_spz_of_streams_is_one_line(tmp_path: Path) -> None:
         good[:20]: "truncated: .spz header of 20 bytes, expected 32",
         good[:50]: "its table lies outside the file",
         good[:-3]: "corrupt or truncated .spz: a stream",
-        good[:15] + b"\4" + good[16:]: ".spz with 4 streams, expected 5",
+        good[:15] + b"\4" + good[16:]: "the .spz has 4 streams, expected 5",
         good[:112] + b"\0" * (len(good) - 112): "corrupted .spz data",
         good[:32] + struct.pack("<QQ", len(bomb), 1 << 26) + good[48:112] + bomb: "of which 9 are needed",
-        gzip.compress(good): "version 4 inside gzip; unpack it first",
+        gzip.compress(good): "the gzip data contain a .spz of version 4; unpack it first",
     }.items():
         (tmp_path / "4.spz").write_bytes(data)
         with pytest.raises(UserError, match=re.escape(said)):

@@ -37,7 +37,7 @@ def ply_with(name: str, value: float, row: int) -> bytes:
 
 def test_missing_file_and_folder(tmp_path: Path) -> None:
     assert message(tmp_path / "no.ply") == "no such file or folder; check the path"
-    assert message(tmp_path) == "a folder without meta.json; give an unbundled SOG folder or a capture file"
+    assert message(tmp_path) == "the folder has no meta.json; give an unbundled SOG folder or a capture file"
     assert message(written(tmp_path / "a.ply", b"")) == "the file is empty; copy or export it again"
 
 
@@ -148,8 +148,8 @@ def test_text_ply_that_is_not_numbers(tmp_path: Path) -> None:
 def test_compressed_ply_without_its_parts(tmp_path: Path) -> None:
     data = good_bytes("b.ply")
     for old, new, expected in (
-        (b"float max_scale_z", b"float something", "compressed .ply without max_scale_z; export it again"),
-        (b"uint packed_scale", b"uint packed_other", "compressed .ply without packed_scale; export it again"),
+        (b"float max_scale_z", b"float something", "the compressed .ply has no max_scale_z; export it again"),
+        (b"uint packed_scale", b"uint packed_other", "the compressed .ply has no packed_scale; export it again"),
         (b"element chunk 1", b"element chunk 0", "7 Gaussians need 1 chunks, found 0; export it again"),
         (b"uchar f_rest_3", b"uchar f_nest_3", "element sh has 7 rows of 9 properties, expected 7 of 9, 24 or 45"),
     ):
@@ -171,9 +171,9 @@ def test_bad_spz(tmp_path: Path) -> None:
         "gzip data, but no .spz inside; unpack it first if it holds another format"
     )
     assert message(written(path, gzip.compress(body[:4] + struct.pack("<I", 7) + body[8:]))) == (
-        ".spz version 7, expected 1 to 4; export it as version 4 or as .ply"
+        "the .spz has version 7, expected 1 to 4; export it as version 4 or as .ply"
     )
-    assert message(written(path, gzip.compress(body[:12] + b"\x09" + body[13:]))).startswith(".spz with SH degree 9")
+    assert message(written(path, gzip.compress(body[:12] + b"\x09" + body[13:]))).startswith("the .spz has SH degree 9")
     assert message(written(path, b"NGSP\x04\0\0\0")).startswith("truncated: .spz header of 8 bytes, expected 16")
     # A file of 300 bytes that declares four thousand million Gaussians is refused before memory is allocated.
     many = gzip.compress(body[:8] + b"\xff\xff\xff\xff" + body[12:])

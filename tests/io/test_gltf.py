@@ -123,7 +123,7 @@ def _changed(tree: dict[str, Any], case: str) -> None:
 @pytest.mark.parametrize(
     ("case", "said"),
     [
-        ("a mesh", "glTF without splats (KHR_gaussian_splatting)"),
+        ("a mesh", "the glTF has no splats (KHR_gaussian_splatting)"),
         ("packed", "packed by KHR_gaussian_splatting_compression_sog are not supported"),
         ("linear", "the colour space 'lin_rec709_display'"),
         ("long", "accessor 0 extends beyond its buffer"),

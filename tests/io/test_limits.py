@@ -103,7 +103,7 @@ def test_positions_without_an_integer_part(tmp_path: Path) -> None:
     body = bytearray(gzip.decompress(good_bytes("a.spz")))
     body[13] = 255
     assert message(written(tmp_path / "a.spz", gzip.compress(bytes(body)))) == (
-        ".spz with 255 fractional bits, but a position has 24 bits; export it again"
+        "the .spz has 255 fractional bits, but a position has 24 bits; export it again"
     )
 
 

@@ -121,7 +121,7 @@ def test_bad_zip(tmp_path: Path) -> None:
     assert message(written(tmp_path / "a.sog", data[: len(data) // 2])).startswith("corrupted zip (")
     with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
         archive.writestr("a.txt", "hello")
-    assert message(tmp_path / "b.sog").startswith("a zip without meta.json; give a .sog")
+    assert message(tmp_path / "b.sog").startswith("the zip has no meta.json; give a .sog")
     with zipfile.ZipFile(tmp_path / "c.sog", "w") as archive:
         archive.writestr("inner/meta.json", json.dumps({"version": 2, "count": 1, "means": {"files": ["a", "b"]}}))
     assert message(tmp_path / "c.sog") == "inner/a is missing from the zip; copy or export the file again"

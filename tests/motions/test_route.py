@@ -67,7 +67,7 @@ def test_paths_are_read_with_their_lines(tmp_path: Path) -> None:
     for text, message in (
         ("", "no points; give lines of two numbers"),
         ("ahead,left\n", "no points; give lines of two numbers"),
-        ("0.5,0\n0.6\n", "line 2: '0.6': give two numbers, ahead and left"),
+        ("0.5,0\n0.6\n", "line 2: '0.6': give two numbers, ahead and left in body heights"),
         ("0.5,0\n0.6,x\n", "line 2: '0.6,x': give two numbers"),
         ("0.5,nan\n", "line 1: '0.5,nan': give two numbers"),
         ("0.5,0\n3,0\n", "line 2: the path jumps by 2.5 body heights; give points at most 1 apart"),

@@ -247,7 +247,7 @@ def test_a_turntable_shows_one_frame(run: FinishedRun, tmp_path: Path) -> None:
         (["--fps", "nan"], "--fps nan: give a number of frames per second"),
         (["--camera", "sideways"], "--camera sideways: give auto, fixed, follow, orbit or a path.json"),
         (["--camera", "none.json"], "none.json: no such file"),
-        (["--camera", "{tmp}/bad.json"], "bad.json: key 0 needs time, eye [x, y, z] and target [x, y, z], finite"),
+        (["--camera", "{tmp}/bad.json"], "bad.json: key 0 needs a finite time, eye [x, y, z] and target"),
         (["--camera", "{tmp}/back.json"], "back.json: the times of its keys do not increase"),
         (["--camera", "{tmp}/up.json"], "up.json: its camera points straight up or down"),
         (["--camera", "{tmp}/fov.json"], "fov.json: fov of key 0 is 180; give degrees from 1 to 150"),

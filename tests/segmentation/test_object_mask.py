@@ -126,7 +126,7 @@ def test_impossible_masks_are_reported() -> None:
     floor_only = np.zeros_like(mask)
     floor_only[-8:, 30:60] = True
     for view, message in (
-        (MaskedView(camera, mask[:50], "m.png"), "m.png: the mask is 96 x 50 pixels, its camera 96 x 96"),
+        (MaskedView(camera, mask[:50], "m.png"), "m.png: the mask has 96 x 50 pixels, but its camera has 96 x 96"),
         (MaskedView(camera, np.zeros_like(mask), "m.png"), "m.png: the mask is empty; mark the object in it"),
         (MaskedView(camera, sky), "no part of the capture is visible inside the masks"),
         (MaskedView(away, mask), "the masks' cameras see no part of the capture"),
@@ -198,7 +198,7 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=message):
             read_object(text, cloud, given, view=view)
     Image.fromarray(mask[:30]).save(tmp_path / "IMG_02.png")
-    with pytest.raises(UserError, match=r"the mask is 64 x 30 pixels, the photo IMG_02\.jpg 64 x 64"):
+    with pytest.raises(UserError, match=r"the mask has 64 x 30 pixels, but the photo IMG_02\.jpg has 64 x 64"):
         read_object(str(tmp_path / "IMG_02.png"), cloud, posed)
 
 

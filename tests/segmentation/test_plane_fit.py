@@ -106,7 +106,9 @@ def test_several_views_are_fitted_together() -> None:
 def test_views_that_cannot_be_fitted_are_reported() -> None:
     camera = camera_over(TRUTH, 0.0)
     depth = plane_depth(TRUTH, camera)
-    with pytest.raises(UserError, match=r"mask of view 0 is \(50, 40\) pixels, its camera's picture \(120, 90\)"):
+    with pytest.raises(
+        UserError, match=r"mask of view 0 has \(50, 40\) pixels, but the picture of its camera has \(120, 90\)"
+    ):
         fit_plane([PlaneView(camera, depth, np.ones((40, 50), bool))])
     with pytest.raises(UserError, match="only 0 pixels inside the masks have a depth, fewer than 30"):
         fit_plane([PlaneView(camera, np.zeros_like(depth), np.ones_like(depth, bool))])

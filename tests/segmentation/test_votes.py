@@ -73,7 +73,7 @@ def test_a_hidden_gaussian_has_little_weight(device: str) -> None:
 
 def test_a_mask_of_another_size_is_refused() -> None:
     view = MaskedView(camera(), np.ones((10, 10), bool), "photo7.png")
-    with pytest.raises(UserError, match=r"photo7\.png: the mask is 10 x 10 pixels, its camera 56 x 40"):
+    with pytest.raises(UserError, match=r"photo7\.png: the mask has 10 x 10 pixels, but its camera has 56 x 40"):
         blending_votes(random_cloud("cpu"), [view])
 
 
