@@ -89,7 +89,7 @@ def test_picture_of_floats(harness: ModuleType, tmp_path: Path) -> None:
 
 def test_an_aim_is_judged_or_explained(harness: ModuleType) -> None:
     options = harness.flags("What.", quick="less", device="cpu").parse_args([])
-    with pytest.raises(ValueError, match="aims without a value or a reason: fast"):
+    with pytest.raises(ValueError, match="aims without a value need a reason in why_null: fast"):
         harness.record(options, [], aims={"fast": None})
 
 
