@@ -103,7 +103,7 @@ def packed(data: bytes) -> str:
         (with_object(front="ahead"), "the front of 'a toy' must be three numbers"),
         (with_object(gaussians="%"), "the Gaussians of 'a toy' are damaged; pick the object again"),
         (with_object(gaussians=packed(b"abc")), r"the Gaussians of 'a toy' are damaged: they are not \d+ bits"),
-        (with_object(gaussians=packed(bytes(1 << 24))), r"damaged: not \d+ bits"),
+        (with_object(gaussians=packed(bytes(1 << 24))), r"damaged: they are not \d+ bits"),
         (with_object(gaussians=7), "the Gaussians of 'a toy' are damaged"),
     ],
 )

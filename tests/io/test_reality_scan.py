@@ -104,7 +104,7 @@ def test_invalid_rows_are_excluded(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("a,b\n1,2\n", "no line with the names of the columns (heading, pitch, roll, ...)"),
+        ("a,b\n1,2\n", "it has no line with the names of the columns (heading, pitch, roll, ...)"),
         ("#name,x,y,alt,heading,pitch,roll\n", "line 1 has no column f; export Internal/External camera parameters"),
         (COLUMNS, "it has no cameras; export Internal/External camera parameters"),
         (f"{COLUMNS}\n00.jpg,{'1,5,' * 15}", "line 2 has 32 fields, but there are 16 columns; export numbers with dec"),
