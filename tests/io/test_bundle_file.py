@@ -96,7 +96,10 @@ def _double(entry: dict[str, Any]) -> None:
         ),
         (lambda t: _arrays(t)["bands"].update(lower=[0] * 3), "bodies/0: lower of bands is not -128 steps"),
         (lambda t: t.update(light={"direction": [0, 0, 1]}), "light: 'half_angle' is a required property"),
-        (lambda t: t.update(light=_light(direction=[0, 0, 2])), "the direction, angle, shade or irradiance of the light"),
+        (
+            lambda t: t.update(light=_light(direction=[0, 0, 2])),
+            "the direction, angle, shade or irradiance of the light",
+        ),
         (lambda t: t.update(light=_light(shade=1)), "light/shade: 1 is greater than or equal to the maximum of 1"),
         (lambda t: _arrays(t).update(normals=_arrays(t)["means"]), "bodies/0/normals: its bytes overlap"),
         (lambda t: t["bodies"].reverse(), "the arrays are not in order: those of all bodies, then the first blocks"),

@@ -113,9 +113,7 @@ def test_failures_of_colmap_are_one_line(
     out = tmp_path / "out"
     assert main(["pose", str(photos_of_noise(tmp_path / "photos")), "--out", str(out)]) == 2
     said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith(
-        "egs-warp: pose: COLMAP cannot continue (No registered database factory succeeded.); check"
-    )
+    assert said.startswith("egs-warp: pose: COLMAP cannot continue (No registered database factory succeeded.); check")
     assert not out.exists()
 
 
