@@ -16,7 +16,7 @@ from egs_warp.geometry.main_light import MainLight, check_light
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import MAX_COORDINATE, MAX_TEXT_BYTES, read_bytes
-from egs_warp.io.text import whole_number
+from egs_warp.io.text import load_json, whole_number
 
 _MAX_TEXELS = 1 << 13
 """Maximum number of rows or columns of a hole's window."""
@@ -217,10 +217,10 @@ def read_planes(path: Path | str) -> list[PlaneRecord]:
     path = Path(path)
     try:
         data = read_bytes(path, at_most=MAX_TEXT_BYTES, missing="make it with egs-warp plane, or give nx,ny,nz,d")
-        tree = json.loads(data, parse_int=whole_number)
+        tree = load_json(data, parse_int=whole_number)
     except UserError:
         raise
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise UserError(f"{path}: not readable JSON; make it with egs-warp plane") from error
     entries = tree.get("planes") if isinstance(tree, dict) else None
     if not isinstance(entries, list) or not entries:

@@ -19,7 +19,7 @@ from typing import Any
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.atomic import atomic_write, lock, result_folder, sweep, sweep_all
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
-from egs_warp.io.text import parse_json, read_text
+from egs_warp.io.text import load_json, parse_json, read_text
 from egs_warp.version import __version__
 
 MANIFEST = "manifest.json"
@@ -275,8 +275,8 @@ def _is_unfinished(folder: Path) -> bool:
 def _manifest(folder: Path) -> Any:
     """Return the manifest; None if it is damaged."""
     try:
-        return json.loads(read_bytes(folder / MANIFEST, at_most=MAX_TEXT_BYTES))
-    except (ValueError, RecursionError):
+        return load_json(read_bytes(folder / MANIFEST, at_most=MAX_TEXT_BYTES))
+    except ValueError:
         return None
 
 

@@ -20,6 +20,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.io.arrays import READ_ERRORS, read_npz
 from egs_warp.io.atomic import atomic_write
+from egs_warp.io.text import load_json
 from egs_warp.version import __version__
 
 SECONDS = 30.0
@@ -54,11 +55,11 @@ class Checkpoint:
             raise UserError(f"{self.path}: there is no checkpoint of an interrupted training; start without resuming")
         try:
             state: State = dict(read_npz(self.path))
-            facts = json.loads(str(state.pop("facts")))
+            facts = load_json(str(state.pop("facts")))
             if sorted(state) != facts["arrays"]:
                 raise ValueError("arrays are missing or added")
             state |= facts["state"]
-        except (*READ_ERRORS, RecursionError) as error:
+        except READ_ERRORS as error:
             raise UserError(f"{self.path}: the checkpoint is damaged; start the training again") from error
         if facts.get("digest") != digest:
             raise UserError(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import gzip
-import json
 import tempfile
 import time
 from collections.abc import Callable
@@ -32,6 +31,7 @@ from egs_warp.io.photos import read_mask_file, read_photo
 from egs_warp.io.planes import read_planes
 from egs_warp.io.ply import read_point_ply
 from egs_warp.io.run_folder import MANIFEST, has_finished
+from egs_warp.io.text import load_json
 from egs_warp.locomotion.replay import Replay
 from egs_warp.motions.beats import read_beats
 from egs_warp.motions.command import read_drive
@@ -289,12 +289,12 @@ _MESSAGES = [
 def _messages(path: Path) -> None:
     """Read messages as the server of ``live`` does; an invalid one gives a one-line error."""
     try:
-        tree = json.loads(path.read_bytes())
+        tree = load_json(path.read_bytes())
         for message in tree if isinstance(tree, list) else [tree]:
             if not isinstance(message, dict):
                 raise ValueError("not an object")
             read_message(message, height=1.0, node_count=50)
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise UserError(str(error)[:200].replace("\n", " ")) from None
 
 
