@@ -176,7 +176,8 @@ def make_body(
     if not MIN_HEIGHT <= height <= MAX_HEIGHT:
         raise ArgumentError(
             "metres_per_unit",
-            f"the body is {height:.3g} m high; choose it so that the height is {MIN_HEIGHT:g} to {MAX_HEIGHT:g} m",
+            f"the body is {height:.3g} m high; choose a value that gives a height of {MIN_HEIGHT:g} to"
+            f" {MAX_HEIGHT:g} m",
         )
     young = density * GRAVITY * height / sag
     node_mass = mesh.lumped_masses(density)

@@ -191,7 +191,7 @@ def effort_cost(
         reference=problem.dt * predicted_velocities,
     )
     if factors.status is FactorStatus.NONE:
-        raise UnsolvableStepError("the effort matrix of the predicted end could not be factored")
+        raise UnsolvableStepError("the effort matrix at the predicted end state could not be factored")
     unit = weight / (body.weight * body.height)
     return QuadraticCost(
         unit * quadratic[:-1, :-1],

@@ -96,7 +96,7 @@ class ContactShape:
         if self.point_weights.shape != (count, 4) or self.point_tets.shape != (count,):
             raise ValueError("its contact points and their weights differ in number")
         if self.rest_positions.shape[1:] != (3,) or self.origin.shape != (3,) or self.coefficients.ndim != 3:
-            raise ValueError("its arrays have wrong shapes")
+            raise ValueError("the shapes of its rest positions, origin or coefficients are wrong")
         if min(self.coefficients.shape) < 3 or not (np.isfinite(self.coefficients).all() and self.spacing > 0.0):
             raise ValueError("its level set is invalid")
 
