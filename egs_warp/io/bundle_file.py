@@ -127,7 +127,7 @@ def _read(data: bytes) -> tuple[BundleFile | None, list[str]]:
 
 
 def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is not a number of JSON")
+    raise ValueError(f"{name} is not a number in JSON")
 
 
 def _schema_problems(text: Any) -> Iterator[str]:

@@ -192,13 +192,15 @@ def has_finished(out: Path | str) -> bool:
         raise UserError(f"{path}: not a manifest of a run; start the run again")
     command = manifest.get("command", ANIMATE)
     if command not in RESUMABLE:
-        raise UserError(f"{out}: egs-warp {command} wrote here, which cannot be resumed; start it again")
+        raise UserError(
+            f"{out}: it has an output of egs-warp {command}, which cannot be resumed; run that command again"
+        )
     if manifest.get("finished") is True:
         return True
     if manifest.get("version") != __version__:
         raise UserError(
-            f"{path}: the run was started by egs-warp {manifest.get('version')}, this is {__version__}, which may"
-            " compute other steps; start the run again"
+            f"{path}: the run was started by egs-warp {manifest.get('version')}, but this is version"
+            f" {__version__}, whose steps may differ; start the run again"
         )
     return False
 

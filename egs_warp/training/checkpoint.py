@@ -52,7 +52,7 @@ class Checkpoint:
         if not self._resume:
             return None
         if not self.path.is_file():
-            raise UserError(f"{self.path}: no checkpoint of an interrupted training here; start without resuming")
+            raise UserError(f"{self.path}: there is no checkpoint of an interrupted training; start without resuming")
         try:
             state: State = dict(read_npz(self.path))
             facts = load_json(str(state.pop("facts")))
@@ -63,7 +63,7 @@ class Checkpoint:
             raise UserError(f"{self.path}: the checkpoint is damaged; start the training again") from error
         if facts.get("digest") != digest:
             raise UserError(
-                f"{self.path}: it belongs to other photos, other flags or another version of egs-warp;"
+                f"{self.path}: it belongs to other photos, other settings or another version of egs-warp;"
                 " start the training again"
             )
         return state

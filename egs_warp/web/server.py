@@ -272,5 +272,7 @@ def _bind(port: int) -> socket.socket:
     except (OSError, OverflowError) as error:
         listener.close()
         reason = getattr(error, "strerror", None) or str(error)
-        raise ArgumentError("port", f"cannot be used ({reason}); give another, or 0 for any", value=port) from error
+        raise ArgumentError(
+            "port", f"cannot be used ({reason}); give another port, or 0 for any free one", value=port
+        ) from error
     return listener
