@@ -22,6 +22,7 @@ from egs_warp.locomotion.contact_modes import (
     ModeSearchResult,
     PredictedContact,
     search_modes,
+    solve_mode_region,
     solve_relaxed,
 )
 from egs_warp.locomotion.device_search import ModeSearchWorkspace, RelaxationWorkspace, search_modes_device
@@ -177,21 +178,27 @@ def test_contacts_without_a_pivot_are_left_to_the_host(own: float, device: str) 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_almost_redundant_contacts_do_not_fail(device: str) -> None:
-    """Rows of the contacts of a stiff base are nearly dependent, which makes the updated inverse of the active
-    rows inaccurate. The search recovers from it. The optimum of its first region is that of the host up to the
-    distance by which bounds are relaxed, since multipliers are large."""
+    """Rows of the contacts of a stiff base are nearly dependent, which makes the updated inverse of the active rows
+    inaccurate. The search recovers from it and finds the optimum of its first region.
+
+    The solvers relax the bounds by different small distances. By duality, a relaxation by d lowers the optimum by at
+    most d times the sum of the multipliers, which are large here. Beyond that, objectives of programs that differ by
+    1e-15 differ by up to 5 %, because the equations for the contact forces have a condition number of 1e7.
+    """
+    relaxation, rounding = 5e-5, 0.1
     for seed in range(40):
         program = body_program(seed, 20, 12, softness=1e-4)
         start, modes = entered(program)
-        given: dict[str, Any] = {"qp_limit": 1}
-        there = search_modes_device(program, start, modes, device=wp.get_device(device), **given)
-        here = search_modes(program, start, modes, solver=QpSolver.OSQP, **given)
+        there = search_modes_device(program, start, modes, device=wp.get_device(device), qp_limit=1)
         assert there is not None and search_modes_device(
             program, start, modes, qp_limit=12, device=wp.get_device(device)
         )
-        assert there.infeasible == here.infeasible
-        if here.x is not None:
-            assert there.objective == pytest.approx(here.objective, rel=0.05)
+        sticking = ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
+        here = solve_mode_region(program, start, sticking, QpSolver.DAQP)
+        assert (there.x is None) == (here is None)
+        if here is not None:
+            least = (1.0 - rounding) * here.objective - relaxation * here.multiplier.sum()
+            assert least <= there.objective <= (1.0 + rounding) * here.objective
 
 
 @pytest.mark.parametrize("device", DEVICES)
