@@ -91,7 +91,7 @@ def use_device(device: str) -> None:
         ) from error
     if device not in (devices := [str(known) for known in wp.get_devices()]):
         near = did_you_mean(device, devices)
-        raise ArgumentError("device", f"this machine has {', '.join(devices)}{near}", value=device)
+        raise ArgumentError("device", f"this machine has {', '.join(devices)}{near}; give one of these", value=device)
 
 
 @cache

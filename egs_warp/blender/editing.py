@@ -66,12 +66,13 @@ def write_cage(path: Path, root: bpy.types.Object, performance: Performance) -> 
         raise ValueError(_NO_REST_OBJECTS)
     cages = _rest_objects(root, "MESH")
     if len(cages) != 1:
-        raise ValueError(f'the collection "{root.name} {_SUFFIX}" has {len(cages)} meshes; leave the cage there alone')
+        name = f"{root.name} {_SUFFIX}"
+        raise ValueError(f'the collection "{name}" has {len(cages)} meshes; it must contain exactly one, the cage')
     points = np.array([vertex.co for vertex in cages[0].data.vertices], float).reshape(-1, 3)
     if len(points) != len(muscles.rest_nodes):
         raise ValueError(
-            f"the cage has {len(points)} vertices, not its {len(muscles.rest_nodes)} nodes; move vertices, and neither"
-            " add nor remove any"
+            f"the cage has {len(points)} vertices, but the run has {len(muscles.rest_nodes)} nodes; move vertices"
+            " without adding or removing any"
         )
     nodes, tets = muscles.in_capture(_in_root(points, cages[0], root)), performance.bundle.arrays["cage_tets"]
     lines = ["MeshVersionFormatted 2", "Dimension 3", "Vertices", str(len(nodes))]

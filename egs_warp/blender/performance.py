@@ -225,7 +225,9 @@ def _read_run(folder: Path) -> Performance:
             camera=_camera(creature),
         )
     except _READ_ERRORS as error:
-        raise ReadError(f"{folder}: the files of the run do not fit together ({_reason(error)})") from error
+        raise ReadError(
+            f"{folder}: the files are not of the same run ({_reason(error)}); run egs-warp animate again"
+        ) from error
 
 
 def _rotation_vectors(quaternions: np.ndarray) -> np.ndarray:
@@ -271,7 +273,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
     except FileNotFoundError as error:
         raise ReadError(f"{path}: is missing; choose the folder of a finished run of egs-warp animate") from error
     except _READ_ERRORS as error:
-        raise ReadError(f"{path}: cannot be read ({_reason(error)})") from error
+        raise ReadError(f"{path}: cannot be read ({_reason(error)}); run egs-warp animate again") from error
 
 
 def _reason(error: Exception) -> str:

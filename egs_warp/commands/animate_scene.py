@@ -72,7 +72,9 @@ def motions_of(text: str, names: Sequence[str], props: Sequence[str]) -> dict[st
         if name in props:
             raise UserError(f"--motion {part!r}: {name} is a prop, which has no muscles; leave --prop {name} out")
         if name in motions:
-            raise UserError(f"--motion {part!r}: {name} has another motion, too; separate its motions by commas")
+            raise UserError(
+                f"--motion {part!r}: {name} already has a motion; separate the motions of an object by commas"
+            )
         motions[name] = motion
     for name, motion in motions.items():
         check_motion(motion, [other for other in names if other != name])

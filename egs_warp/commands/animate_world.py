@@ -77,7 +77,7 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
 
     shot, background = shot_of(args)
     if background is not None:
-        raise UserError("--background: a world has a colour or transparent as its background; give one of these")
+        raise UserError("--background: the background of a world must be a colour or transparent; give one of these")
     check_frames(args.frames)
     style = read_style(args.style) if args.style is not None else None
     view_from = None if args.view_from is None else parse_direction("view-from", args.view_from)

@@ -130,7 +130,7 @@ def _read(path: Path) -> dict[Any, Any]:
 
     tree, _ = read_yaml(path)
     if not isinstance(tree, dict):
-        raise UserError(f"{path}: no keys and values; write one flag per line, such as motion: jump")
+        raise UserError(f"{path}: the file has no keys and values; write one flag per line, such as motion: jump")
     return tree
 
 

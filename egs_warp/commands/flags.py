@@ -155,7 +155,8 @@ def parse_plane(text: str) -> Plane:
     plane = Plane.from_coefficients(nx, ny, nz, d)
     if abs(plane.offset) > MAX_COORDINATE:
         raise UserError(
-            f"--plane {text}: lies {abs(plane.offset):g} units from the origin; give at most {MAX_COORDINATE:g}"
+            f"--plane {text}: the plane lies {abs(plane.offset):g} units from the origin; give one at most"
+            f" {MAX_COORDINATE:g} units away"
         )
     return plane
 

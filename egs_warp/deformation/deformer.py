@@ -218,7 +218,9 @@ def node_positions(positions: wp.array | np.ndarray, node_count: int, device: wp
         UserError: N is not ``node_count``.
     """
     if len(positions) != node_count:
-        raise UserError(f"deformation: {len(positions)} node positions for a cage of {node_count} nodes")
+        raise UserError(
+            f"deformation: {len(positions)} node positions for a cage of {node_count} nodes; give one for each node"
+        )
     if isinstance(positions, wp.array) and positions.dtype == Vec3 and positions.device == device:
         return positions
     values = positions.numpy() if isinstance(positions, wp.array) else np.asarray(positions, dtype=np.float64)

@@ -175,7 +175,9 @@ def embed_points(mesh: TetMesh, points: np.ndarray, *, device: str | wp.Device |
     points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
-        raise UserError(f"embedding: {len(bad)} of {len(points)} points are not finite (first: number {bad[0]})")
+        raise UserError(
+            f"embedding: {len(bad)} of {len(points)} points are not finite (first: number {bad[0]}); give finite points"
+        )
     locator = CageLocator(mesh, device=device)
     return locator.locate(wp.array(points, dtype=Vec3, device=locator.device))
 

@@ -105,7 +105,9 @@ class GaussianCloud:
                 f" (first: number {np.argmax(too_large)}); remove them and export again"
             )
         if np.shape(sh)[1] not in (1, 4, 9, 16):
-            raise UserError(f"capture: {np.shape(sh)[1]} SH coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
+            raise UserError(
+                f"capture: {np.shape(sh)[1]} SH coefficients, expected 1, 4, 9 or 16 (degree 0 to 3); export it again"
+            )
 
         def upload(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=dtype, device=device)

@@ -37,7 +37,7 @@ def check_light(light: MainLight) -> None:
     is_valid = np.isfinite(numbers).all() and abs(float(np.linalg.norm(light.direction)) - 1.0) < 1e-3
     is_valid &= 0.0 < light.half_angle < 90.0 and 0.0 <= light.shade < 1.0 and mean_irradiance(light) > 0.0
     if not is_valid or not np.allclose(light.irradiance, light.irradiance.T):
-        raise ValueError("the light is invalid")
+        raise ValueError("the direction, angle, shade or irradiance of the light is invalid")
 
 
 def mean_irradiance(light: MainLight) -> float:

@@ -37,11 +37,11 @@ class RigidPath:
         if len(times) < 2 or not (np.diff(times) > 0.0).all() or not np.isfinite(times).all():
             raise UserError("path: give at least one point, and ascending times above 0 s")
         if len(shifts) != len(times) or len(turns) != len(times):
-            raise UserError("path: give a shift, and if any a turn, for each time")
+            raise UserError("path: give one shift for each time, and either no turns or one for each time")
         if not (np.isfinite(shifts).all() and np.isfinite(turns).all()):
             raise UserError("path: give finite shifts and turns")
         if self.repeat and (shifts[-1].any() or turns[-1] % 360.0 != 0.0):
-            raise UserError("path: it is repeated, but does not end where it starts; add the start as its last point")
+            raise UserError("path: a path that is repeated must end where it starts; add the start as its last point")
 
     def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return times (K + 1,), shifts (K + 1, 3) and turns (K + 1,) with the start."""

@@ -20,6 +20,7 @@ from egs_warp.io.bundle_arrays import PackedArray
 from egs_warp.io.bundle_track import PARENTS, WEIGHT_STEP
 from egs_warp.io.limits import MAX_COORDINATE, MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.planes import light_from_json
+from egs_warp.io.text import load_json
 
 MAGIC = b"EGSB"
 """First bytes of a bundle."""
@@ -84,8 +85,8 @@ def _read(data: bytes) -> tuple[BundleFile | None, list[str]]:
     if length > min(len(data) - HEAD.size, MAX_TEXT_BYTES):
         return None, [f"the JSON text of {length} bytes is longer than the file or than {MAX_TEXT_BYTES} bytes"]
     try:
-        text = json.loads(data[HEAD.size : HEAD.size + length], parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
+        text = load_json(data[HEAD.size : HEAD.size + length], parse_constant=_refuse_constant)
+    except ValueError as error:
         return None, [f"the JSON text cannot be read ({error})"]
     problems = list(_schema_problems(text))
     if problems:
@@ -126,7 +127,7 @@ def _read(data: bytes) -> tuple[BundleFile | None, list[str]]:
 
 
 def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is not a number of JSON")
+    raise ValueError(f"{name} is not a number in JSON")
 
 
 def _schema_problems(text: Any) -> Iterator[str]:

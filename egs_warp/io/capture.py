@@ -183,7 +183,7 @@ def _decode_folder(folder: Path) -> RawCapture:
     nested = sorted(path for path in folder.glob(f"*/{_META}") if path.is_file())
     if len(nested) == 1:
         return _decode_meta(nested[0])
-    raise UserError(f"{folder}: a folder without meta.json; give an unbundled SOG folder or a capture file")
+    raise UserError(f"{folder}: the folder has no meta.json; give an unbundled SOG folder or a capture file")
 
 
 def _decode_meta(meta: Path) -> RawCapture:
@@ -202,7 +202,7 @@ def _decode_zip(source: Path) -> RawCapture:
             metas.sort(key=lambda name: (name.count("/"), name))
             if not metas:
                 raise UserError(
-                    f"{source}: a zip without meta.json; give a .sog, or unpack it if it holds another capture"
+                    f"{source}: the zip has no meta.json; give a .sog, or unpack it if it holds another capture"
                 )
 
             # Inflate only requested members, and only up to the checked size.

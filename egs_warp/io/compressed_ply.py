@@ -71,7 +71,7 @@ def decode_compressed_ply(data: bytes, header: PlyHeader, source: Path) -> RawCa
     bounds = _BOUNDS if "min_r" in chunk_names else _BOUNDS[:12]
     missing = [n for n in bounds if n not in chunk_names] + [n for n in _PACKED if n not in vertex_names]
     if chunk is None or vertex is None or missing:
-        raise UserError(f"{source}: compressed .ply without {', '.join(missing)}; export it again")
+        raise UserError(f"{source}: the compressed .ply has no {', '.join(missing)}; export it again")
     if len(chunk) * _CHUNK < len(vertex):
         raise UserError(
             f"{source}: {len(vertex)} Gaussians need {-(-len(vertex) // _CHUNK)} chunks, found {len(chunk)}; "

@@ -65,7 +65,7 @@ def decode_glb(data: bytes, source: Path) -> RawCapture:
         place += 8 + size
     text = chunks.get(JSON_CHUNK, b"")
     if not text or len(text) > MAX_TEXT_BYTES:
-        raise UserError(f"{source}: .glb without a JSON chunk of at most {MAX_TEXT_BYTES} bytes; export it again")
+        raise UserError(f"{source}: the .glb has no JSON chunk of at most {MAX_TEXT_BYTES} bytes; export it again")
 
     def read(number: int, uri: str | None) -> bytes | None:
         if uri is None:
@@ -150,7 +150,9 @@ class _Asset:
         splats = [[p for p in mesh["primitives"] if _is_splats(p)] for mesh in meshes]
         if not any(splats):
             kind = f", only {len(meshes)} mesh{'es' * (len(meshes) > 1)}" if meshes else ""
-            raise UserError(f"{self.source}: glTF without splats ({EXTENSION}){kind}; export it as splats, or as .ply")
+            raise UserError(
+                f"{self.source}: the glTF has no splats ({EXTENSION}){kind}; export it as splats, or as .ply"
+            )
         placed = placements(self.tree, self.source, self._accessor, lambda mesh: bool(splats[mesh]))
         parts = {mesh: [self._primitive(p) for p in splats[mesh]] for mesh in {one.mesh for one in placed}}
         left_out = sum(1 for mesh, found in enumerate(splats) if found and mesh not in parts)
@@ -197,8 +199,8 @@ class _Asset:
         unknown = [name for name in required if name not in _READ and not str(name).startswith(_SURFACES)]
         if unknown:
             raise UserError(
-                f"{self.source}: it requires {', '.join(map(str, dict.fromkeys(unknown)))}, which is not read; export"
-                " it without, or as .ply or .spz"
+                f"{self.source}: it requires {', '.join(map(str, dict.fromkeys(unknown)))}, which is not supported;"
+                " export it without this extension, or as .ply or .spz"
             )
 
     def _check_copies(self, shown: list[_Splats], parts: dict[int, list[_Splats]]) -> None:
@@ -206,8 +208,8 @@ class _Asset:
         own = sum(len(part.means) for found in parts.values() for part in found)
         if count > own + _MAX_COPIES:
             raise UserError(
-                f"{self.source}: its instances turn {own} Gaussians into {count}; at most {_MAX_COPIES} more are"
-                " read; export fewer"
+                f"{self.source}: its instances turn {own} Gaussians into {count}; at most {_MAX_COPIES} more are read;"
+                " export fewer instances"
             )
 
     def _primitive(self, primitive: dict[str, Any]) -> _Splats:
@@ -216,7 +218,8 @@ class _Asset:
         nested = extension.get("extensions", {})
         if extension.get("kernel", "ellipse") != "ellipse":
             raise UserError(
-                f"{self.source}: splats of the kernel {extension['kernel']!r} are not read; export ellipses"
+                f"{self.source}: splats with the kernel {extension['kernel']!r} are not supported; export them with"
+                " the kernel 'ellipse'"
             )
         if not str(extension.get("colorSpace", "srgb_rec709_display")).startswith("srgb"):
             raise UserError(
@@ -233,7 +236,7 @@ class _Asset:
             position = self.tree["accessors"][primitive["attributes"]["POSITION"]]
             if others and "bufferView" not in position:
                 raise UserError(
-                    f"{self.source}: splats packed by {others[0]} are not read; export them unpacked, or as .spz"
+                    f"{self.source}: splats packed by {others[0]} are not supported; export them unpacked, or as .spz"
                 )
             splats = self._unpacked(primitive["attributes"])
         return replace(splats, antialiased=True) if antialiased else splats
@@ -318,7 +321,9 @@ class _Asset:
         accessor = self.tree["accessors"][number]
         if "sparse" in accessor or "bufferView" not in accessor:
             kind = "sparse" if "sparse" in accessor else "without data"
-            raise UserError(f"{self.source}: accessor {number} is {kind}, which is not read; export it in full")
+            raise UserError(
+                f"{self.source}: accessor {number} is {kind}, which is not supported; export all of its values"
+            )
         view = self.tree["bufferViews"][accessor["bufferView"]]
         kind, width, count = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
         stride = view.get("byteStride", kind.itemsize * width)
@@ -342,7 +347,7 @@ class _Asset:
         data = self.read(number, buffer.get("uri"))
         if data is None:
             packing = next((name for name in view.get("extensions", {}) if "compression" in name), None)
-            reason = f"they are packed by {packing}, which is not read" if packing else "it has no uri"
+            reason = f"they are packed by {packing}, which is not supported" if packing else "it has no uri"
             raise UserError(f"{self.source}: the data of buffer {number} are missing: {reason}; export it unpacked")
         return data
 

@@ -39,14 +39,17 @@ def check_count(count: int, size: int, source: Path) -> None:
     """Raise ``UserError`` for more Gaussians than a packed file of ``size`` bytes can contain, because each position
     needs at least one byte."""
     if count > size + FREE_GAUSSIANS:
-        raise UserError(f"{source}: it declares {count} Gaussians in {size} bytes; copy or export it again")
+        raise UserError(
+            f"{source}: it declares {count} Gaussians, more than its {size} bytes can hold; copy or export it again"
+        )
 
 
 def check_pixels(width: int, height: int, what: str, *, at_most: int = MAX_PIXELS) -> None:
     """Raise ``UserError`` for a picture or camera with too many pixels; the message begins with ``what``."""
     if max(width, height) > MAX_SIDE or width * height > at_most:
         raise UserError(
-            f"{what} has {width} x {height} pixels; at most {MAX_SIDE} a side and {at_most} in all are read"
+            f"{what} has {width} x {height} pixels; the limits are {MAX_SIDE} a side and {at_most} in all; make it"
+            " smaller"
         )
 
 

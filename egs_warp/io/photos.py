@@ -172,7 +172,7 @@ def _orientation_to_fit(posed: PosedImage, shape: tuple[int, ...]) -> int:
     if turn >= 5 and _same_aspect(camera, height, width):
         return turn
     raise UserError(
-        f"{posed.image}: {width} x {height} pixels, but its camera has {camera.width} x {camera.height};"
+        f"{posed.image}: the photo has {width} x {height} pixels, but its camera has {camera.width} x {camera.height};"
         " use the photos that the poses were made from"
     )
 
@@ -201,7 +201,8 @@ def _oriented_mask(path: Path, shape: tuple[int, ...], turn: int) -> np.ndarray:
     is_stored = _is_scaled((width, height), size)
     if not is_stored and not (turn >= 5 and _is_scaled((height, width), size)):
         raise UserError(
-            f"{path}: {size[0]} x {size[1]} pixels, but its photo has {width} x {height}; make the mask from the same"
+            f"{path}: the mask has {size[0]} x {size[1]} pixels, but its photo has {width} x {height}; make the"
+            " mask from the same"
             " photo"
         )
     mask = read_mask_file(path, at_most=min(MAX_MASK_RATIO * width * height, MAX_PIXELS))

@@ -134,7 +134,7 @@ def _from_json(entry: Any, path: Path, number: int, count: int) -> PickedObject:
     except (TypeError, ValueError, binascii.Error, zlib.error) as error:
         raise UserError(f"{path}: the Gaussians of {name!r} are damaged; {_REMEDY}") from error
     if len(packed) != size:
-        raise UserError(f"{path}: the Gaussians of {name!r} are damaged: not {count} bits; {_REMEDY}")
+        raise UserError(f"{path}: the Gaussians of {name!r} are damaged: they are not {count} bits; {_REMEDY}")
     gaussians = np.unpackbits(np.frombuffer(packed, np.uint8), count=count).astype(bool)
     if not gaussians.any():
         raise UserError(f"{path}: {name!r} has no Gaussians; {_REMEDY}")

@@ -16,7 +16,7 @@ from egs_warp.geometry.main_light import MainLight, check_light
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import MAX_COORDINATE, MAX_TEXT_BYTES, read_bytes
-from egs_warp.io.text import whole_number
+from egs_warp.io.text import load_json, whole_number
 
 _MAX_TEXELS = 1 << 13
 """Maximum number of rows or columns of a hole's window."""
@@ -116,7 +116,10 @@ class PlaneRecord:
         nx, ny, nz = normal.tolist()
         plane = Plane.from_coefficients(nx, ny, nz, offset)
         if abs(plane.offset) > MAX_COORDINATE:
-            raise UserError(f"{path}: plane {number} lies {abs(plane.offset):g} units from the origin; make it again")
+            raise UserError(
+                f"{path}: plane {number} lies {abs(plane.offset):g} units from the origin, the limit is"
+                f" {MAX_COORDINATE:g}; make it again"
+            )
         try:
             centre = np.array(entry["centre"], dtype=float).reshape(3) if "centre" in entry else None
             numbers = {name: float(entry[name]) for name in _NUMBERS if name in entry}
@@ -160,7 +163,7 @@ def _ground_from_json(entry: Any, path: Path) -> HeightField:
         )
         check_grid(ground)
     except (TypeError, KeyError, ValueError, OverflowError, AttributeError, UserError) as error:
-        raise UserError(f"{path}: its ground is damaged; make it again with egs-warp segment") from error
+        raise UserError(f"{path}: its ground is damaged; write the file again with egs-warp segment") from error
     return ground
 
 
@@ -184,7 +187,7 @@ def light_from_json(entry: Any) -> MainLight:
             np.array(entry["irradiance"], dtype=float).reshape(4, 4),
         )
     except (TypeError, KeyError, ValueError, OverflowError, AttributeError) as error:
-        raise ValueError("the light is invalid") from error
+        raise ValueError("the direction, angle, shade or irradiance of the light is invalid") from error
     check_light(light)
     return light
 
@@ -194,7 +197,7 @@ def _light_of_entry(entry: Any, path: Path) -> MainLight:
     try:
         return light_from_json(entry)
     except ValueError as error:
-        raise UserError(f"{path}: its light is damaged; make it again with egs-warp segment") from error
+        raise UserError(f"{path}: its light is damaged; write the file again with egs-warp segment") from error
 
 
 _NUMBERS = ("size", "noise", "inlier_share", "support")
@@ -214,10 +217,10 @@ def read_planes(path: Path | str) -> list[PlaneRecord]:
     path = Path(path)
     try:
         data = read_bytes(path, at_most=MAX_TEXT_BYTES, missing="make it with egs-warp plane, or give nx,ny,nz,d")
-        tree = json.loads(data, parse_int=whole_number)
+        tree = load_json(data, parse_int=whole_number)
     except UserError:
         raise
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise UserError(f"{path}: not readable JSON; make it with egs-warp plane") from error
     entries = tree.get("planes") if isinstance(tree, dict) else None
     if not isinstance(entries, list) or not entries:

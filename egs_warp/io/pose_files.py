@@ -60,7 +60,8 @@ def find_poses(source: Path) -> PoseSource:
             if path.is_file():
                 return PoseSource(path, source, (f"poses are read from {path}",))
     raise UserError(
-        f"{source}: no camera poses; give a COLMAP model, a cameras.json, a transforms.json, RealityScan's camera"
+        f"{source}: it contains no camera poses; give a COLMAP model, a cameras.json, a transforms.json,"
+        " RealityScan's camera"
         " parameters (.csv) or Metashape's cameras (.xml)"
     )
 

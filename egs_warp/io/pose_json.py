@@ -20,7 +20,7 @@ from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.orientation import orientation
 from egs_warp.io.photo_files import PhotoAndMask, PhotoFiles
 from egs_warp.io.posed_images import ExcludedPhoto, PosedImage, checked_camera, convert_each, is_rotation, size_of_photo
-from egs_warp.io.text import decimal_number, decode_text, whole_number
+from egs_warp.io.text import decimal_number, decode_text, load_json, whole_number
 
 _DISTORTIONS = (
     *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"),
@@ -40,14 +40,14 @@ def parse_pose_json(source: Path) -> Any:
     """Parse a JSON file of poses. Raises ``UserError`` if it is not JSON."""
     text = decode_text(read_bytes(source, at_most=MAX_TEXT_BYTES), source)
     try:
-        return json.loads(text, parse_int=whole_number)
-    except (ValueError, RecursionError) as error:
+        return load_json(text, parse_int=whole_number)
+    except ValueError as error:
         # Replace numbers that JSON does not define by NaN, so that only the photos that use them are invalid.
         repaired = _TOKEN.sub(lambda token: token[0] if token[0].startswith('"') else "NaN", text)
         if repaired != text:
             try:
-                return json.loads(repaired, parse_int=whole_number)
-            except (ValueError, RecursionError):
+                return load_json(repaired, parse_int=whole_number)
+            except ValueError:
                 pass
         where = f" at line {error.lineno} ({error.msg})" if isinstance(error, json.JSONDecodeError) else ""
         raise UserError(f"{source}: not readable JSON{where}; give a cameras.json or a transforms.json") from error
@@ -242,7 +242,7 @@ class _Record:
         """Return the numbers of a field; NaN if it does not contain numbers."""
         try:
             return np.array(_with_decimal_points(self.fields.get(key)), dtype=np.float64)
-        except (TypeError, ValueError, OverflowError, RecursionError):
+        except (TypeError, ValueError, OverflowError):
             return np.array(np.nan)
 
     def focal(self, key: str) -> float:

@@ -46,7 +46,9 @@ def read_reality_scan(source: Path, files: PhotoFiles) -> tuple[list[PosedImage]
     lines = text.splitlines()
     start = next((at for at, line in enumerate(lines) if {"heading", "pitch"} <= _words(line)), None)
     if start is None:
-        raise UserError(f"{source}: no line with the names of the columns (heading, pitch, roll, ...); {_EXPORT}")
+        raise UserError(
+            f"{source}: it has no line with the names of the columns (heading, pitch, roll, ...); {_EXPORT}"
+        )
     separator = next((one for one in _SEPARATORS if lines[start].count(one) >= 3), ",")
     columns = [name.strip(' #"').lower() for name in lines[start].split(separator)]
     columns = [_OTHER_NAMES.get(name, name) for name in columns]

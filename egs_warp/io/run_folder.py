@@ -19,7 +19,7 @@ from typing import Any
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.atomic import atomic_write, lock, result_folder, sweep, sweep_all
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
-from egs_warp.io.text import parse_json, read_text
+from egs_warp.io.text import load_json, parse_json, read_text
 from egs_warp.version import __version__
 
 MANIFEST = "manifest.json"
@@ -191,13 +191,15 @@ def has_finished(out: Path | str) -> bool:
         raise UserError(f"{path}: not a manifest of a run; start the run again")
     command = manifest.get("command", ANIMATE)
     if command not in RESUMABLE:
-        raise UserError(f"{out}: egs-warp {command} wrote here, which cannot be resumed; start it again")
+        raise UserError(
+            f"{out}: it has an output of egs-warp {command}, which cannot be resumed; run that command again"
+        )
     if manifest.get("finished") is True:
         return True
     if manifest.get("version") != __version__:
         raise UserError(
-            f"{path}: the run was started by egs-warp {manifest.get('version')}, this is {__version__}, which may"
-            " compute other steps; start the run again"
+            f"{path}: the run was started by egs-warp {manifest.get('version')}, but this is version"
+            f" {__version__}, whose steps may differ; start the run again"
         )
     return False
 
@@ -273,8 +275,8 @@ def _is_unfinished(folder: Path) -> bool:
 def _manifest(folder: Path) -> Any:
     """Return the manifest; None if it is damaged."""
     try:
-        return json.loads(read_bytes(folder / MANIFEST, at_most=MAX_TEXT_BYTES))
-    except (ValueError, RecursionError):
+        return load_json(read_bytes(folder / MANIFEST, at_most=MAX_TEXT_BYTES))
+    except ValueError:
         return None
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.io.limits import check_count, check_pixels, picture_size
 from egs_warp.io.raw import BAND_4, SH_COUNTS, RawCapture, bands_note, full_bands, largest_restored, logits_from_bytes
+from egs_warp.io.text import load_json
 
 _SH_COUNTS = (*SH_COUNTS, BAND_4)
 LABELS_PER_ROW = 64
@@ -65,8 +66,8 @@ class SogMeta:
     def __init__(self, data: bytes, source: Path) -> None:
         self.source = source
         try:
-            self.tree = json.loads(data)
-        except (ValueError, RecursionError) as error:
+            self.tree = load_json(data)
+        except ValueError as error:
             raise UserError(f"{source}: meta.json is not readable JSON; copy or export the capture again") from error
 
     def entry(self, *keys: str) -> object:

@@ -80,7 +80,7 @@ def decode_spz(data: bytes, source: Path) -> RawCapture:
     axes = None
     if layout.version == 4:
         if gzipped:
-            raise UserError(f"{source}: .spz version 4 inside gzip; unpack it first")
+            raise UserError(f"{source}: the gzip data contain a .spz of version 4; unpack it first")
         check_count(layout.count, len(data), source)
         body = header + inflate_streams(data, [layout.count * width for width in layout.widths], source)
         axes = stored_axes(data, source) if layout.flags & _HAS_EXTENSIONS else None
@@ -141,12 +141,12 @@ def _layout(header: bytes, gzipped: bool, source: Path) -> _Layout:
     if magic != _MAGIC:
         raise UserError(f"{source}: gzip data, but no .spz inside; unpack it first if it holds another format")
     if version not in (1, 2, 3, 4):
-        raise UserError(f"{source}: .spz version {version}, expected 1 to 4; export it as version 4 or as .ply")
+        raise UserError(f"{source}: the .spz has version {version}, expected 1 to 4; export it as version 4 or as .ply")
     if degree >= len(_SH_COUNTS):
-        raise UserError(f"{source}: .spz with SH degree {degree}, expected 0 to 4; export it again")
+        raise UserError(f"{source}: the .spz has SH degree {degree}, expected 0 to 4; export it again")
     if version > 1 and fractional_bits > _MAX_FRACTIONAL_BITS:
         raise UserError(
-            f"{source}: .spz with {fractional_bits} fractional bits, but a position has 24 bits; export it again"
+            f"{source}: the .spz has {fractional_bits} fractional bits, but a position has 24 bits; export it again"
         )
     return _Layout(version, count, _SH_COUNTS[degree], fractional_bits, flags)
 

@@ -45,7 +45,7 @@ def inflate_streams(data: bytes, sizes: Sequence[int], source: Path) -> bytes:
     table, count = _table(data, source)
     nonempty = [size for size in sizes if size > 0]
     if count != len(nonempty):
-        raise UserError(f"{source}: .spz with {count} streams, expected {len(nonempty)}; export it again")
+        raise UserError(f"{source}: the .spz has {count} streams, expected {len(nonempty)}; export it again")
     end = table + count * _ROW.size
     rows = [_ROW.unpack_from(data, table + k * _ROW.size) for k in range(count)]
     blocks = []

@@ -42,7 +42,7 @@ class StageRecord:
         if not isinstance(tree, dict) or not all(
             isinstance(one, dict) and isinstance(one.get("files"), dict) for one in tree.values()
         ):
-            raise UserError(f"{path}: not a record of stages; choose another folder, or move it aside")
+            raise UserError(f"{path}: not a record of stages; choose another folder, or move this file away")
         self._stages: dict[str, Any] = tree
 
     def state(self, stage: str, key: str) -> StageState:

@@ -41,7 +41,7 @@ def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[s
     import cv2
 
     if len(frames) != len(labels) or not frames:
-        raise UserError(f"contact sheet: {len(frames)} frames and {len(labels)} labels; give one label to each frame")
+        raise UserError(f"contact sheet: {len(frames)} frames and {len(labels)} labels; give one label for each frame")
     height, width = (max(frame.shape[axis] for frame in frames) for axis in (0, 1))
     rows = -(-len(frames) // columns)
     sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
@@ -171,7 +171,7 @@ class VideoWriter:
         if frame.shape != self._shape or frame.dtype != np.uint8:
             raise UserError(
                 f"{self._path}: a frame has shape {frame.shape} and type {frame.dtype},"
-                f" expected {self._shape} and uint8"
+                f" expected {self._shape} and uint8; give frames of one shape"
             )
         height, width, _ = self._shape
         if height % 2 or width % 2:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from egs_warp.errors import UserError, did_you_mean
-from egs_warp.io.text import read_text
+from egs_warp.io.text import MAX_NESTING, read_text
 
 
 def read_yaml(path: Path) -> tuple[Any, Any]:
@@ -22,13 +22,26 @@ def read_yaml(path: Path) -> tuple[Any, Any]:
     import yaml
 
     class Plain(yaml.SafeLoader):
-        """YAML loader without aliases, because a few lines of nested aliases can expand beyond the available memory."""
+        """YAML loader without aliases, because a few lines of nested aliases can expand beyond the available memory.
+
+        Nesting is limited for the reason given in ``load_json``.
+        """
+
+        depth = 0
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
                 where = self.peek_event().start_mark
                 raise yaml.MarkedYAMLError(problem="an alias, *name; write out what it stands for", problem_mark=where)
-            return super().compose_node(parent, index)
+            self.depth += 1
+            if self.depth > MAX_NESTING:
+                where = self.peek_event().start_mark
+                raise yaml.MarkedYAMLError(
+                    problem="lists are nested too deeply; write fewer levels", problem_mark=where
+                )
+            node = super().compose_node(parent, index)
+            self.depth -= 1
+            return node
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
             keys: set[str] = set()
@@ -46,7 +59,7 @@ def read_yaml(path: Path) -> tuple[Any, Any]:
             return None if node is None else loader.construct_document(node), node
         finally:
             loader.dispose()
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError) as error:
         if isinstance(error, UserError):
             raise
         raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); correct it") from error

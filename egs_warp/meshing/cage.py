@@ -138,7 +138,7 @@ def cage_of_body(
         UserError: the object has no volume (it is flat or tiny, or nothing opaque lies above the plane).
     """
     if not MIN_NODES <= target_nodes <= MAX_NODES:
-        raise UserError(f"cage: {target_nodes} nodes; give a number from {MIN_NODES} to {MAX_NODES}")
+        raise UserError(f"cage: {target_nodes} nodes are requested; give a number from {MIN_NODES} to {MAX_NODES}")
     solid = solid or solid_from_gaussians(cloud)
     _check_thickness(solid)
     weights = np.where(solid.belongs, cloud.opacities(), 0.0)
@@ -191,8 +191,8 @@ def cage_of_mesh(cloud: GaussianCloud, mesh: TetMesh, solid: LatticeSolid) -> Ca
     enclosed = _enclosed_share(cloud, mesh, np.where(solid.belongs, cloud.opacities(), 0.0), everything)
     if enclosed < _MIN_OWN_ENCLOSED_FRACTION:
         raise UserError(
-            f"cage: the mesh encloses {100.0 * enclosed:.0f} % of the object; give one around it, in the coordinates"
-            " of the capture",
+            f"cage: the mesh encloses {100.0 * enclosed:.0f} % of the object; give a mesh that encloses it, in the"
+            " coordinates of the capture",
             check=("up", "plane"),
         )
     return Cage(

@@ -44,7 +44,7 @@ def read_cage_mesh(path: Path) -> TetMesh:
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise UserError(f"{path}: cannot be read as a mesh ({reason[0][:200]}); write it again") from error
     if not MIN_NODES <= len(nodes) <= MAX_NODES:
-        raise UserError(f"{path}: {len(nodes)} nodes in tetrahedra; give a mesh with {MIN_NODES} to {MAX_NODES}")
+        raise UserError(f"{path}: its tetrahedra have {len(nodes)} nodes; give a mesh with {MIN_NODES} to {MAX_NODES}")
     if nodes.shape[1] != 3 or not (np.abs(nodes) <= MAX_COORDINATE).all():
         raise UserError(f"{path}: a node does not have three finite coordinates; write it again")
     corners = nodes[tets]

@@ -126,7 +126,7 @@ def level_set_of_surface(vertices: np.ndarray, faces: np.ndarray, *, cells: int 
         UserError: the number of cells is out of range, or the surface has no extent.
     """
     if not MIN_CELLS <= cells <= MAX_CELLS:
-        raise UserError(f"level set: {cells} cells; give a number from {MIN_CELLS} to {MAX_CELLS}")
+        raise UserError(f"level set: {cells} cells are requested; give a number from {MIN_CELLS} to {MAX_CELLS}")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     spacing = float((high - low).max()) / cells
     if not spacing > 0.0:

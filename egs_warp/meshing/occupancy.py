@@ -132,7 +132,7 @@ def _solid_within(
     if not occupied.any():
         raise UserError(
             f"object: nothing opaque stands on the plane (of {cloud.count} Gaussians, {int(np.sum(means[:, 2] > 0))} "
-            f"are above it; the largest opacity is {opacities.max():.2g})",
+            f"are above it; the largest opacity is {opacities.max():.2g}); check the plane and the object",
             check=("plane", "up"),
         )
     node = np.rint(means / spacing).astype(int) - corner

@@ -62,9 +62,9 @@ def read_beats(path: Path) -> tuple[float, ...]:
             raise UserError(f"{where}: is not after the previous beat, {beats[-1]:g}; give beats in increasing order")
         beats.append(time)
     if not beats:
-        raise UserError(f"{path}: no beats; give one time in seconds per line")
+        raise UserError(f"{path}: it has no beats; give one time in seconds per line")
     if len(beats) > MAX_BEATS:
-        raise UserError(f"{path}: {len(beats)} beats; at most {MAX_BEATS} are allowed")
+        raise UserError(f"{path}: it has {len(beats)} beats; give at most {MAX_BEATS}")
     return tuple(beats)
 
 

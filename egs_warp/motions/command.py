@@ -99,7 +99,7 @@ def read_drive(path: Path) -> DrivePlan:
         except ArgumentError as error:
             raise UserError(f"{where}: {error}") from None
     if not times:
-        raise UserError(f"{path}: no commands; give lines of four numbers, time,forward,sideways,turn")
+        raise UserError(f"{path}: it has no commands; give lines of four numbers, time,forward,sideways,turn")
     try:
         return DrivePlan(tuple(times), tuple(commands))
     except ArgumentError as error:

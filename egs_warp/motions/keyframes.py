@@ -109,11 +109,11 @@ def read_keyframes(path: Path) -> tuple[Key, ...]:
     """
     path = Path(path)
     if path.suffix.lower() not in (".json", ".csv"):
-        raise UserError(f"{path}: key frames are read from .json or .csv")
+        raise UserError(f"{path}: key frames are read from .json or .csv; give one of these")
     text = read_text(path)
     keys = _from_json(text, path) if path.suffix.lower() == ".json" else _from_csv(text, path)
     if not keys:
-        raise UserError(f"{path}: no key frames; give at least one")
+        raise UserError(f"{path}: it has no key frames; give at least one")
     channels(keys)
     return tuple(keys)
 
@@ -125,7 +125,7 @@ def checked_keys(keys: Sequence[Key]) -> tuple[Key, ...]:
         UserError: for the first malformed key, by its number.
     """
     if not keys:
-        raise UserError("keys: no key frames; give at least one")
+        raise UserError("keys: the list is empty; give at least one key frame")
     checked = []
     for number, key in enumerate(keys, start=1):
         quantity = key.quantity.value if isinstance(key.quantity, Quantity) else key.quantity
@@ -144,11 +144,12 @@ def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
     groups: dict[tuple[str, Quantity], list[Key]] = {}
     for key in keys:
         group = groups.setdefault((key.part, key.quantity), [])
-        before, what = (group[-1].time, "the key before") if group else (0.0, "the start")
+        before, what = (group[-1].time, "the previous key") if group else (0.0, "the start")
         if round(key.time - before, 9) < MIN_GAP:
             raise UserError(
-                f"{key.where}: time {key.time:g} is not {MIN_GAP:g} s after {before:g}, {what} of "
-                f"{key.part} {key.quantity.value}; give keys in the order of their times, at least that far apart"
+                f"{key.where}: time {key.time:g} is less than {MIN_GAP:g} s after {what} of {key.part}"
+                f" {key.quantity.value} at {before:g} s; give keys in the order of their times, at least {MIN_GAP:g} s"
+                " apart"
             )
         group.append(key)
     return tuple(
@@ -195,7 +196,7 @@ def _from_csv(text: str, path: Path) -> list[Key]:
         if not any(cell.strip() for cell in row):
             continue
         if len(row) != len(header):
-            raise UserError(f"{where}: {len(row)} values for {len(header)} columns")
+            raise UserError(f"{where}: {len(row)} values for {len(header)} columns; give one for each column")
         cells = dict(zip(header, (cell.strip() for cell in row), strict=True))
         entry: dict[str, Any] = {"part": cells["part"], "quantity": cells["quantity"]}
         entry["time"] = _parse_cell(cells["time"])

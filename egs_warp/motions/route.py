@@ -119,12 +119,14 @@ def read_path(path: Path) -> np.ndarray:
                 continue  # header line
             point = []
         if len(point) != 2 or not np.all(np.isfinite(point)):
-            raise UserError(f"{path}, line {number}: {line.strip()[:60]!r}: give two numbers, ahead and left")
+            raise UserError(
+                f"{path}, line {number}: {line.strip()[:60]!r}: give two numbers, ahead and left in body heights"
+            )
         gap = float(np.linalg.norm(np.subtract(point, points[-1] if points else (0.0, 0.0))))
         if gap > _MAX_GAP:
             advice = f"give points at most {_MAX_GAP:g} apart, the first at most that far from the start 0,0"
             raise UserError(f"{path}, line {number}: the path jumps by {gap:.3g} body heights; {advice}")
         points.append(point)
     if not points:
-        raise UserError(f"{path}: no points; give lines of two numbers, ahead and left in body heights")
+        raise UserError(f"{path}: it has no points; give lines of two numbers, ahead and left in body heights")
     return np.array(points)

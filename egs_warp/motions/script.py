@@ -155,7 +155,7 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
         raise ArgumentError("beats", f"no motion of {text.strip()!r} takes beats; add a dance")
     for name in values.keys() & defaults.keys():
         if not any(name in request.asked for request in requests):
-            raise ArgumentError(name, f"no motion of {text.strip()!r} takes it")
+            raise ArgumentError(name, f"no motion of {text.strip()!r} takes this number; leave it out")
     return Script(tuple(requests))
 
 
@@ -307,7 +307,7 @@ def _own_style(text: Any, name: str, where: str) -> Style | None:
     if not _kind(name, where).jumps:
         raise UserError(f"{where}: {name} does not jump, so it has no style; jump, hop, twist and dance have one")
     if "overlap" in text:
-        raise UserError(f"{where}: overlap belongs to the body; give it in the style of the whole run")
+        raise UserError(f"{where}: overlap is a property of the whole run; give it in the style of the run")
     try:
         return read_style(text)
     except UserError as error:

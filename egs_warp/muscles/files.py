@@ -63,7 +63,7 @@ def read_muscles(path: Path | str, mesh: TetMesh, *, body_weight: float, frame: 
     _refuse_unknown_keys(f"{path}", content, _FILE_KEYS)
     entries = content.get("fibres")
     if not isinstance(entries, list) or not entries:
-        raise UserError(f'{path}: no fibres; give a list "fibres" with at least one entry')
+        raise UserError(f'{path}: it has no fibres; give a list "fibres" with at least one entry')
     max_strain = _positive(f"{path}", content, "max_strain", 0.3)
     if max_strain >= 1.0:
         raise UserError(f'{path}: "max_strain" is {max_strain:g}; give a number below 1')
@@ -209,7 +209,7 @@ def _check(path: Path, fibres: list[Fibre], mesh: TetMesh, frame: BodyFrame) -> 
             raise UserError(f"{where} has two equal points in a row; remove one")
     count = sum(len(fibre.points) - 1 for fibre in fibres)
     if count > MAX_SEGMENTS:
-        raise UserError(f"{path}: {count} segments in all; use at most {MAX_SEGMENTS}")
+        raise UserError(f"{path}: its fibres have {count} segments in all; use at most {MAX_SEGMENTS}")
 
 
 def _refuse_unknown_keys(where: str, entry: dict[str, Any], known: set[str]) -> None:

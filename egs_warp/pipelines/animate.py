@@ -320,7 +320,9 @@ def _requested(motion: Script | str, options: AnimateOptions) -> Script:
         return script(motion, **given)
     for name, value in given.items():
         if value is not None:
-            raise ArgumentError(name, "the motion is a script with numbers of its own; give one of them", value=value)
+            raise ArgumentError(
+                name, "the motion is a script, which contains its own numbers; leave one of the two out", value=value
+            )
     return motion
 
 

@@ -212,8 +212,8 @@ def inspect_capture(
     if lowest > _MAX_GAP * height:
         raise UserError(
             f"object: its body hangs {lowest / height:.2g} of its height above the ground that was"
-            f" {'found' if plane is None else 'given'}; parts of the capture that lie lower are apart from it: cut them"
-            " away, or give the ground",
+            f" {'found' if plane is None else 'given'}; lower parts of the capture are not connected to the body:"
+            " cut them away, or give the ground",
             check=("plane", "up"),
         )
     progress("front")

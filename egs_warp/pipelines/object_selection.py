@@ -96,7 +96,8 @@ def read_object(
             specs.append(_parse_location(text, posed, view, names))
     if len(specs) > 1:
         raise UserError(
-            f"{names.object}: {len(specs)} objects, {values[0]} and others; give one, and correct it with clicks"
+            f"{names.object}: {len(specs)} objects are given, {values[0]} and others; give one, and correct it"
+            " with clicks"
             " +u,v@photo"
         )
     if mask_model is not None:
@@ -155,9 +156,9 @@ def _parse_location(
     try:
         numbers = np.array([float(part) for part in text.split(",")])
     except ValueError:
-        raise UserError(f"{names.object} {text}: neither a file nor numbers; {names.help}") from None
+        raise UserError(f"{names.object} {text}: this is neither a file nor numbers; {names.help}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
-        raise UserError(f"{names.object} {text}: {len(numbers)} numbers; {names.help}")
+        raise UserError(f"{names.object} {text}: these are {len(numbers)} numbers; {names.help}")
     if np.abs(numbers).max() > MAX_COORDINATE:
         raise UserError(f"{names.object} {text}: further than {MAX_COORDINATE:g} units from the origin; {names.help}")
     if len(numbers) == 3:
@@ -176,9 +177,9 @@ def _pixel(
     try:
         finite = np.isfinite([float(u), float(v)]).all()
     except ValueError:
-        raise UserError(f"{names.object} {text}: neither a file nor numbers; {names.help}") from None
+        raise UserError(f"{names.object} {text}: this is neither a file nor numbers; {names.help}") from None
     if not finite:
-        raise UserError(f"{names.object} {text}: not two numbers; {names.help}")
+        raise UserError(f"{names.object} {text}: these are not two numbers; {names.help}")
     if not posed:
         raise UserError(f"{names.object} {text}: a pixel needs cameras; give {names.cameras}, or a point x,y,z")
     return _click(cloud, _view_named(posed, view, text, names), u, v, text, names, inside=True)
@@ -210,7 +211,9 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str, names:
     if view is None:
         if len(posed) == 1:
             return posed[0]
-        raise UserError(f"{names.object} {what}: {len(posed)} cameras; choose one with {names.view} NAME or NUMBER")
+        raise UserError(
+            f"{names.object} {what}: there are {len(posed)} cameras; choose one with {names.view} NAME or NUMBER"
+        )
     # int() fails for superscript digits, which isdecimal excludes, and for thousands of digits, hence the limit.
     if view.isdecimal() and len(view) < _MAX_DIGITS and int(view) < len(posed):
         return posed[int(view)]
@@ -231,7 +234,7 @@ def _read_masks(
     """Read a mask file or a folder of masks, undistorted and reduced to at most ``MAX_MASK_SIDE`` pixels."""
     files = sorted(path.glob("*.png")) if path.is_dir() else [path]
     if not files:
-        raise UserError(f"{names.object} {path}: no .png in this folder; {names.help}")
+        raise UserError(f"{names.object} {path}: this folder has no .png; {names.help}")
     if not posed:
         raise UserError(f"{names.object} {path}: a mask needs its camera; give {names.cameras}, or a point or box")
     masks = []
@@ -242,8 +245,8 @@ def _read_masks(
         # Check the size before decoding, because a small file can contain a very large image.
         if size != (camera.width, camera.height):
             raise UserError(
-                f"{file}: the mask is {size[0]} x {size[1]} pixels, the photo {one.name} "
-                f"{camera.width} x {camera.height}; give a mask of the photo's size"
+                f"{file}: the mask has {size[0]} x {size[1]} pixels, but the photo {one.name} has {camera.width} x"
+                f" {camera.height}; give a mask of the photo's size"
             )
         mask = read_mask(file)
         if one.lens is not None:

@@ -131,7 +131,7 @@ def pose_photos(
             say(f"left out {reason}")
         names = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
         if len(names) < _MIN_PHOTOS:
-            raise UserError(f"{source}: {len(names)} readable photos; give at least {_MIN_PHOTOS}")
+            raise UserError(f"{source}: only {len(names)} readable photos were found; give at least {_MIN_PHOTOS}")
         try:
             model = _reconstructed(
                 pycolmap, work, names, in_order=is_video, max_side=max_side, seed=seed, say=say, report=report
@@ -139,7 +139,9 @@ def pose_photos(
         except RuntimeError as error:
             # COLMAP raises this error if its database fails, for example on a full disk.
             reason = next(iter(str(error).splitlines()), "no reason given")
-            raise UserError(f"pose: COLMAP cannot continue ({reason}); is there free space in {out}?") from error
+            raise UserError(
+                f"pose: COLMAP cannot continue ({reason}); check that there is free space in {out}"
+            ) from error
         _write_model(model, work / "sparse" / "0", out)
         try:
             for part in _WRITES:

@@ -185,6 +185,6 @@ def _light_from(arrays: Mapping[str, np.ndarray]) -> MainLight | None:
 def _check_rows(name: str, values: np.ndarray, shape: tuple[int, ...], minimum: int, below: int) -> None:
     """Raise ``ValueError`` unless ``values`` are integers of this ``shape``, from ``minimum`` to below ``below``."""
     if values.shape != shape or values.dtype.kind not in "iu":
-        raise ValueError(f"{name} has shape {values.shape} of {values.dtype}")
+        raise ValueError(f"{name} has shape {values.shape} of {values.dtype}, expected integers of shape {shape}")
     if values.size and not minimum <= values.min() <= values.max() < below:
         raise ValueError(f"{name} has an index out of range")

@@ -73,7 +73,7 @@ def read_collision_mesh(path: Path | str) -> tuple[Solid, ...]:
     count = sum(len(solid.faces) for solid in solids)
     if count > MAX_FACES:
         raise UserError(
-            f"{path}: its obstacles have {count} faces; at most {MAX_FACES} are supported; simplify the mesh, or leave"
+            f"{path}: its obstacles have {count} faces, the limit is {MAX_FACES}; simplify the mesh, or leave"
             " out what is far from the objects"
         )
     return tuple(solids)

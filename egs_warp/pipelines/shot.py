@@ -92,7 +92,7 @@ class Shot:
     def __post_init__(self) -> None:
         if self.size is not None and not all(MIN_SIDE <= side <= MAX_SIDE for side in self.size):
             text = "x".join(map(str, self.size))
-            advice = f"give pixels from {MIN_SIDE} to {MAX_SIDE}, such as 512 or 640x360"
+            advice = f"give sides from {MIN_SIDE} to {MAX_SIDE} pixels, such as 512 or 640x360"
             raise ArgumentError("size", advice, value=text)
         if not 1.0 <= self.fps <= MAX_FPS:
             raise ArgumentError("fps", f"give a number of frames per second from 1 to {MAX_FPS:g}", value=self.fps)
@@ -282,7 +282,7 @@ def _key(path: Path, number: int, entry: Any) -> list[float]:
     except (TypeError, KeyError, ValueError, AttributeError):
         row = []
     if len(row) != 8 or not np.isfinite(row).all() or max(map(abs, row)) > 1e12:
-        raise UserError(f"{path}: key {number} needs time, eye [x, y, z] and target [x, y, z], finite; correct it")
+        raise UserError(f"{path}: key {number} needs a finite time, eye [x, y, z] and target [x, y, z]; correct it")
     if not 1.0 <= row[7] <= 150.0:
         raise UserError(f"{path}: fov of key {number} is {row[7]:g}; give degrees from 1 to 150")
     return row

@@ -224,7 +224,7 @@ def check_frames(frames: int | None) -> None:
         advice = f"give a whole number of at least {MIN_FRAMES}; the first picture is at rest"
         raise ArgumentError("frames", advice, value=frames)
     if frames is not None and frames > MAX_FRAMES:
-        raise ArgumentError("frames", f"give at most {MAX_FRAMES}, which is an hour", value=frames)
+        raise ArgumentError("frames", f"give at most {MAX_FRAMES} frames, which are an hour", value=frames)
 
 
 class Performer:
@@ -411,5 +411,7 @@ def checked_activations(creature: Creature, activations: np.ndarray, step: float
         raise ArgumentError("activations", f"of shape {values.shape}; {advice}")
     # Not "any above the bound", because NaN must be rejected, too.
     if not (np.abs(values) <= creature.muscles.bounds * (1.0 + 1e-9)).all():
-        raise ArgumentError("activations", "outside a muscle's bounds; keep each within muscles.bounds")
+        raise ArgumentError(
+            "activations", "some are outside the bounds of their muscle; keep each within muscles.bounds"
+        )
     return values

@@ -106,7 +106,7 @@ def read_triangles(path: Path, frame: BodyFrame) -> tuple[np.ndarray, np.ndarray
     if points.shape[1] != 3 or not (np.abs(points) <= MAX_COORDINATE).all():
         raise UserError(f"{path}: a vertex does not have three finite coordinates; write it again")
     if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(points):
-        raise UserError(f"{path}: has no triangles, or a triangle with a vertex that is missing; write it again")
+        raise UserError(f"{path}: has no triangles, or a triangle that refers to a missing vertex; write it again")
     return frame.points(points), faces
 
 

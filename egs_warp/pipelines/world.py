@@ -96,7 +96,11 @@ class World:
             ground = surroundings.ground
         if ground is not None and float(ground.normal @ GROUND.normal) < 1.0 - 1e-9:
             given = ",".join(f"{x:.3g}" for x in ground.normal)
-            raise ArgumentError("ground", "its heights are not measured along the z axis of the world", value=given)
+            raise ArgumentError(
+                "ground",
+                "its heights are not measured along the z axis of the world; give a ground with the normal 0,0,1",
+                value=given,
+            )
         self.ground = ground
         self.friction = None if friction is None else checked_friction(friction)
         self._members: dict[str, PlacedBody] = {}
@@ -152,7 +156,9 @@ class World:
         # Not "any above the maximum", because NaN must be rejected, too.
         if not np.abs(numbers).max() <= _MAX_POSITION or above < 0.0:
             given = f"at {at[0]:g}, {at[1]:g}, above {above:g}, heading {heading or 0.0:g}"
-            raise UserError(f"{name}: {given}: give finite numbers up to {_MAX_POSITION:g}, and above of at least 0")
+            raise UserError(
+                f"{name}: {given}: give finite numbers of magnitude at most {_MAX_POSITION:g}, and above of at least 0"
+            )
         device = body.body.assembly.device
         if not device.is_cpu:
             raise UserError(
@@ -252,7 +258,9 @@ class World:
         frame, own = self.surroundings.frame, body.frame
         turn = frame.axes @ own.axes.T
         if abs(own.scale / frame.scale - 1.0) > 1e-6 or turn[2, 2] < 1.0 - 1e-9:
-            raise UserError(f"{name}: its scale and up direction are not those of the surroundings; make it with them")
+            raise UserError(
+                f"{name}: its scale and up direction differ from those of the surroundings; make it with the same ones"
+            )
         return body.moved(
             tuple(frame.points(own.origin).tolist()), float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
         )
@@ -306,7 +314,9 @@ class World:
         if gaps[deepest] < -_MAX_DEPTH * body.body.height:
             solid = int(body.geometry.solid_of_each_plane[faces[deepest]])
             what = f"solid {solid}" if solid else "the ground"
-            raise UserError(f"{member.name}: it is {-gaps[deepest]:.2g} m inside {what} at {_where(member)}; move one")
+            raise UserError(
+                f"{member.name}: it is {-gaps[deepest]:.2g} m inside {what} at {_where(member)}; move one of them"
+            )
 
 
 def _lifted(body: CapturedBody, height: float) -> BodyState:

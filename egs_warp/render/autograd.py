@@ -102,7 +102,7 @@ def _check_tensors(*attributes: torch.Tensor) -> None:
         if tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device != device:
             raise UserError(
                 f"render: {ARRAYS[number]} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device},"
-                f" expected {shape} float32 on {device}"
+                f" expected {shape} float32 on {device}; convert it"
             )
 
 

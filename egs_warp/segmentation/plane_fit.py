@@ -124,8 +124,8 @@ def _gather(views: Sequence[PlaneView], random: np.random.Generator) -> _Pixels:
         for name, values in (("depth", view.depth), ("mask", view.mask)):
             if np.shape(values) != shape:
                 raise UserError(
-                    f"plane: {name} of view {number} is {np.shape(values)[::-1]} pixels, its camera's picture"
-                    f" {shape[::-1]}; resize it to match"
+                    f"plane: {name} of view {number} has {np.shape(values)[::-1]} pixels, but the picture of its camera"
+                    f" has {shape[::-1]}; resize it"
                 )
         valid = view.mask & (view.depth > 0.0) & np.isfinite(view.depth)
         chosen = np.flatnonzero(valid)
@@ -167,7 +167,7 @@ def _sampled(pixels: _Pixels, random: np.random.Generator) -> Plane:
             best, least = plane, cost
     if best is None:
         raise UserError(
-            "plane: the masked points lie on a line or in the line of sight; mark a wider part of the plane"
+            "plane: the masked points lie on a line, or the plane is seen edge-on; mark a wider part of the plane"
         )
     return best
 

@@ -83,7 +83,10 @@ def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
         raise UserError(f"{masks[0].name}: the mask is empty; mark the object in it")
     votes = blending_votes(cloud, marked)
     if not (votes.inside + votes.outside > 0.0).any():
-        raise UserError("object: the masks' cameras see no part of the capture; check that both share one frame")
+        raise UserError(
+            "object: the masks' cameras see no part of the capture; check that cameras and capture have the same"
+            " coordinate frame"
+        )
     return votes
 
 
@@ -92,8 +95,8 @@ def check_size(view: MaskedView) -> None:
     height, width = view.camera.height, view.camera.width
     if view.mask.shape != (height, width):
         raise UserError(
-            f"{view.name}: the mask is {view.mask.shape[1]} x {view.mask.shape[0]} pixels, its camera {width} x"
-            f" {height}; give a mask of the photo's size"
+            f"{view.name}: the mask has {view.mask.shape[1]} x {view.mask.shape[0]} pixels, but its camera has"
+            f" {width} x {height}; give a mask of the photo's size"
         )
 
 

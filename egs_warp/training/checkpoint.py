@@ -20,6 +20,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.io.arrays import READ_ERRORS, read_npz
 from egs_warp.io.atomic import atomic_write
+from egs_warp.io.text import load_json
 from egs_warp.version import __version__
 
 SECONDS = 30.0
@@ -51,18 +52,18 @@ class Checkpoint:
         if not self._resume:
             return None
         if not self.path.is_file():
-            raise UserError(f"{self.path}: no checkpoint of an interrupted training here; start without resuming")
+            raise UserError(f"{self.path}: there is no checkpoint of an interrupted training; start without resuming")
         try:
             state: State = dict(read_npz(self.path))
-            facts = json.loads(str(state.pop("facts")))
+            facts = load_json(str(state.pop("facts")))
             if sorted(state) != facts["arrays"]:
                 raise ValueError("arrays are missing or added")
             state |= facts["state"]
-        except (*READ_ERRORS, RecursionError) as error:
+        except READ_ERRORS as error:
             raise UserError(f"{self.path}: the checkpoint is damaged; start the training again") from error
         if facts.get("digest") != digest:
             raise UserError(
-                f"{self.path}: it belongs to other photos, other flags or another version of egs-warp;"
+                f"{self.path}: it belongs to other photos, other settings or another version of egs-warp;"
                 " start the training again"
             )
         return state

@@ -349,7 +349,8 @@ def _check(
         ):
             if values is not None and (values.shape != expected or not np.isfinite(values).all()):
                 raise UserError(
-                    f"finetune: {name} of view {number} has shape {values.shape}, expected {expected} and finite values"
+                    f"finetune: {name} of view {number} has shape {values.shape}, expected {expected} and finite"
+                    " values; correct it"
                 )
     if trainable is not None and np.shape(trainable) != (cloud.count,):
         raise UserError(f"finetune: trainable has shape {np.shape(trainable)}, expected ({cloud.count},)")

@@ -25,6 +25,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from egs_warp.errors import ArgumentError
+from egs_warp.io.text import load_json
 from egs_warp.web.page import page_text
 
 HOST = "127.0.0.1"
@@ -217,11 +218,11 @@ async def _receive_messages(page: WebSocket, feed: FrameFeed) -> None:
     """Pass the messages of the page to ``feed``; answer an invalid message with an error."""
     while True:
         try:
-            message = json.loads(await page.receive_text())
+            message = load_json(await page.receive_text())
             if not isinstance(message, dict):
                 raise ValueError("not an object")
             feed.receive(message)
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError) as error:
             # Report the error in one line and continue.
             await page.send_text(json.dumps({"error": f"invalid message: {str(error)[:200]}"}))
 
@@ -270,5 +271,7 @@ def _bind(port: int) -> socket.socket:
     except (OSError, OverflowError) as error:
         listener.close()
         reason = getattr(error, "strerror", None) or str(error)
-        raise ArgumentError("port", f"cannot be used ({reason}); give another, or 0 for any", value=port) from error
+        raise ArgumentError(
+            "port", f"cannot be used ({reason}); give another port, or 0 for any free one", value=port
+        ) from error
     return listener
