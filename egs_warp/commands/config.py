@@ -173,8 +173,8 @@ def _for_file(name: str, value: str, folder: Path) -> str:
 
 
 def _parts_of_object(value: str, folder: Path) -> tuple[str, str, str]:
-    """Split a value of ``--object`` into the object's name with its equals sign, the name of a file in ``folder``, and
-    the name of a record in that file; the first and the last may be empty."""
+    """Split a value of ``--object`` into ``NAME=``, the path of a file in ``folder``, and ``:RECORD``, a record of that
+    file. The first and the last may be empty; the middle may also be another value, such as a point ``0,0,1``."""
     if os.path.lexists(folder / value):
         return "", value, ""
     named = NAMED_VALUE.fullmatch(value)

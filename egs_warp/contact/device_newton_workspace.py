@@ -489,7 +489,7 @@ class NewtonWorkspace:
         enqueue_trial(step, self._contacts, self.trial_input[:1], self._direction, self._trial_record)
 
     def _enqueue_internal(self, dt: float) -> None:
-        """Compute the internal gradient and its torque at the end of the trial."""
+        """Enqueue the internal gradient at the end positions of the trial, and its torque."""
         owner = self.owner
         owner.enqueue_gradient(vectors(self.end_positions), dt, self._tensions, vectors(self._gradient))
         torch.mv(owner.rotation_modes.T, self._gradient, out=self._torque)

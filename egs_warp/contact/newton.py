@@ -128,8 +128,8 @@ class ContactLinearizer:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> np.ndarray | None:
-        """Take one Newton step with fixed contact forces. Only one right-hand side has to be solved, while a
-        linearisation solves three for each contact.
+        """Take one Newton step with fixed contact forces. It needs one solve, while a linearisation needs three for
+        each contact.
 
         Args:
             tangent: factored tangent.
@@ -139,7 +139,7 @@ class ContactLinearizer:
             forces: (n, 3) newtons.
 
         Returns:
-            (N, 3) m/s; None if the step inverts an element.
+            (N, 3) m/s, end velocities; None if the step inverts an element.
         """
         problem, workspace = tangent.problem, host_newton_workspace(contacts.node_count)
         state = IterateBuffer.of(contacts, velocities, forces)

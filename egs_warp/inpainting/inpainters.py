@@ -77,7 +77,8 @@ class OpenCvInpainter:
         """Fill the hole; see ``Inpainter.fill``."""
         flag = cv2.INPAINT_TELEA if self.method is OpenCvMethod.TELEA else cv2.INPAINT_NS
         missing = (hole | ~known).astype(np.uint8)
-        # Single channels may have 16 bits. OpenCV's fast marching rounds float32 pictures to integers.
+        # ``cv2.inpaint`` accepts 16 bits only for single channels, and its fast marching rounds float32 pictures to
+        # integers, so each channel is inpainted as uint16.
         coded = np.rint(65535.0 * np.clip(image, 0.0, 1.0)).astype(np.uint16)
         channels = [cv2.inpaint(np.ascontiguousarray(coded[..., k]), missing, self.radius, flag) for k in range(3)]
         return _pasted(image, hole, np.stack(channels, axis=-1).astype(np.float32) / np.float32(65535.0))

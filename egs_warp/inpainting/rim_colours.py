@@ -44,8 +44,8 @@ class RimColours:
         self._common = (film > _COMMON * top) | (top < _PATTERN)
 
     def common(self, place: np.ndarray) -> np.ndarray:
-        """Return the mask (n, k) bool of colours that are common: the colour at pixel ``place`` (n, k, 2) of the
-        picture is not unusual at the pixel of the domain."""
+        """Return the mask (n, k) bool, True where the colour of the picture at pixel ``place`` (n, k, 2) is common at
+        pixel n of the domain."""
         return np.take_along_axis(self._common, self._shade[place[..., 0], place[..., 1]], axis=1)
 
     def islands(self, place: np.ndarray) -> np.ndarray:

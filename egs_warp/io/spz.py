@@ -48,8 +48,8 @@ _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 _MAX_EXTENSION_BYTES = 1 << 20
 _MAX_FRACTIONAL_BITS = 24
 _SH_COUNTS = (*SH_COUNTS, BAND_4)
-# Quantisation steps of SH coefficients above band 0, as in the reference writer. Finer steps would only increase the
-# compressed size.
+# Quantisation steps of SH coefficients above band 0, as in the reference writer. Finer steps would reduce the rounding
+# error, but increase the compressed size.
 _BAND1_STEP, _REST_STEP = 8, 16
 
 

@@ -50,9 +50,9 @@ class Recorder:
             start_gap: minimum gap at ``start``, m.
             drag: alpha of the Rayleigh damping, 1/s.
             frame: placement of the body in its capture.
-            front: (3,) unit vector in which the body faces; None is its x axis.
-            folder: function that returns the folder of the parts, called after the first step; a missing folder is
-                created. None keeps all parts in memory.
+            front: (3,) unit vector of the direction in which the body faces; None is its x axis.
+            folder: function that returns the folder for the parts of the recording, called after the first step; a
+                missing folder is created. None keeps all parts in memory.
         """
         self._folder, self._path = folder, None
         self._steps = self._written = self._requested_steps = 0

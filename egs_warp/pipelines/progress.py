@@ -161,7 +161,8 @@ def render_bar(count: int, *, quiet: bool = False) -> Iterator[Callable[[], obje
 
 @contextmanager
 def _stages(name: str, done: Mapping[str, int], *, quiet: bool, file: TextIO | None) -> Iterator[Callable[[str], None]]:
-    """Show a bar with stages; each starts when ``done`` percent of the total time have elapsed.
+    """Show a bar with the stages that are the keys of ``done``; each value is the percentage of the expected total time
+    after which its stage starts.
 
     The bar appears at the start of the first stage, so that an earlier error prints only one line.
     """

@@ -126,8 +126,8 @@ def test_nested_entries_of_a_stream_end_with_the_first(device: str) -> None:
 
 
 def test_later_work_follows_all_branches_of_a_fork(device: str) -> None:
-    """Branches start after the work before the fork, both if it is executed directly and if it is captured. They
-    compute the sums of long rows that this work fills."""
+    """Branches start after the work before the fork has finished, whether that work is executed directly or captured.
+    The work fills long rows, and the branches compute their sums."""
     stream, count = GraphStream(torch.device(device)), 1 << 20
     upload, rows = PinnedUpload(stream, 1), torch.zeros((4, count), dtype=torch.float64, device=device)
     sums, readback = torch.zeros(4, dtype=torch.float64, device=device), stream.pinned(1)

@@ -40,7 +40,8 @@ def lying(degrees: float, axis: np.ndarray = LEFT) -> BodyState:
 
 @pytest.mark.parametrize(("degrees", "axis"), [(90.0, LEFT), (-60.0, LEFT), (170.0, FORWARD)])
 def test_tilt_of_a_lying_body(degrees: float, axis: np.ndarray) -> None:
-    """The tilt consists of the angle from upright and the horizontal axis of the rotation that restores upright."""
+    """The tilt consists of the angle from upright and the horizontal axis of the rotation that makes the body
+    upright again."""
     angle, about, _ = GetUp(block().place)._tilt(lying(degrees, axis).positions)
     assert np.degrees(angle) == pytest.approx(abs(degrees), abs=1e-6)
     assert about == pytest.approx(-np.sign(degrees) * axis, abs=1e-6)

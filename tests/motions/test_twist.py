@@ -101,7 +101,7 @@ def test_in_the_air_the_width_is_adjusted_to_the_turn(place: Stance) -> None:
         assert jump.phase is JumpPhase.FLIGHT
         shape = objectives[2]
         assert isinstance(shape, Objective)
-        # The rows of the objective are orthonormal in the mass-weighted mean and measure only the velocities of these
+        # The rows of the objective are orthonormal in the mass-weighted mean and measure only the rates of the six
         # strains.
         shares = np.repeat(place.body.node_mass / place.body.mass, 3)
         assert np.allclose((shape.rows / shares) @ shape.rows.T, np.eye(6), atol=1e-12)

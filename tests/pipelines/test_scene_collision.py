@@ -22,7 +22,7 @@ LOW, HIGH = np.array([-2.0, -2.0, -0.1]), np.full(3, 2.0)
 
 
 def depth(solids: tuple[Solid, ...], points: np.ndarray) -> np.ndarray:
-    """Return (n,) the distance of the ``points`` from the nearest solid, as contact detection computes it."""
+    """Return the signed distance (n,) of the ``points`` from the nearest solid, as contact detection computes it."""
     return np.min([np.max([face.heights(points) for face in solid.faces], axis=0) for solid in solids], axis=0)
 
 

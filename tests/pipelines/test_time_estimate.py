@@ -27,8 +27,8 @@ def _estimates(text: str, frames: int | None = None) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("text", ["jump", "hop x2 0.4 0.2", "twist 60", "twist 180", "walk 0.2", "jump 0 0.1, turn 30"])
 def test_the_estimate_is_within_a_factor_of_two(text: str) -> None:
-    """The estimate of the remaining frames is within a factor of two, except for the last ``NEAR`` frames. A twist
-    decides only in the air whether it needs another jump."""
+    """The estimate of the remaining frames is within a factor of two, except for the last ``NEAR`` frames, because a
+    twist decides only in the air whether it needs another jump."""
     done, expected = _estimates(text).T
     count = len(done)
     far = done < count - NEAR

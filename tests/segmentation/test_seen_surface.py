@@ -1,5 +1,5 @@
-"""Positions of the visible surface in an image: those from heights are on the floor, those from depths are biased
-upwards."""
+"""Positions of the visible surface in an image. Those computed from the height over the plane lie on the floor; those
+computed from the depth are biased upwards."""
 
 from __future__ import annotations
 

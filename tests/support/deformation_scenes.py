@@ -11,7 +11,8 @@ from egs_warp.geometry.tetmesh import TetMesh
 
 
 def box(cells: tuple[int, int, int] = (3, 3, 3), size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> TetMesh:
-    """Return a box cage with slightly perturbed inner nodes, so that the Delaunay tetrahedralisation is unique."""
+    """Return a box cage whose nodes are slightly perturbed within the interior, the faces and the edges, so that the
+    Delaunay tetrahedralisation is unique."""
     axes = [np.linspace(0, length, count + 1) for count, length in zip(cells, size, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     jitter = np.random.default_rng(0).uniform(-0.06, 0.06, nodes.shape) * (np.array(size) / cells)
