@@ -60,7 +60,9 @@ def main() -> None:
     arguments = parser.parse_args()
     egs.use_device(arguments.device)
     if arguments.steps < 1 or not 16 <= arguments.size <= 4096:
-        raise egs.UserError("give --steps of at least 1 and a --size from 16 to 4096 pixels")
+        raise egs.UserError(
+            f"--steps {arguments.steps}, --size {arguments.size}: give at least 1 step and 16 to 4096 pixels"
+        )
     egs.writable_folder(arguments.out)
 
     built_in = egs.scene("pawn", device=arguments.device)

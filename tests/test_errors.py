@@ -24,6 +24,8 @@ def test_an_argument_is_called_by_its_name_or_by_its_flag() -> None:
     assert str(error) == "solids: the body is inside solid 2; check plane and muscles_file"
     assert error.format_message(flag_of) == "--terrain: the body is inside solid 2; check --plane and --muscles"
     assert UserError("object: it is flat", check=("up",)).format_message(flag_of) == "object: it is flat; check --up"
+    error = UserError("object: it is flat", check=("plane", "up", "object"))
+    assert error.format_message(flag_of) == "object: it is flat; check --plane, --up and --object"
 
 
 def test_a_line_stays_one_line() -> None:

@@ -92,7 +92,7 @@ def test_the_optimised_jump_gets_higher() -> None:
         ("twist", ["--device", "tpu"], "twist.py: --device tpu: this machine has cpu"),
         ("hop", ["--hops", "0"], "hop.py: motion 1 ('hop x0'): repeat 0; give a whole number"),
         ("acting", ["--motion", "bow + hop"], "acting.py: motion 1 ('bow + hop'): hop is not a gesture; gestures are"),
-        ("finetune", ["--steps", "0"], "finetune.py: give --steps of at least 1"),
+        ("finetune", ["--steps", "0"], "finetune.py: --steps 0, --size 256: give at least 1 step"),
     ],
 )
 def test_bad_flags_are_one_line(

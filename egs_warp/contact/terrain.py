@@ -13,7 +13,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
-from egs_warp.io.text import parse_json, read_text
+from egs_warp.io.text import json_excerpt, parse_json, read_text
 
 MAX_FACES = 64
 """Maximum number of faces in a terrain file."""
@@ -82,11 +82,16 @@ def read_terrain(path: Path) -> tuple[Solid, ...]:
     """
     entries = parse_json(read_text(path), path)
     if not isinstance(entries, list) or not entries:
-        raise UserError(f"{path}: give a list of solids, each a list of faces [nx, ny, nz, d]")
+        found = json_excerpt(entries)
+        raise UserError(f"{path}: it contains {found}; give a list of solids, each a list of faces [nx, ny, nz, d]")
     solids = []
     for number, faces in enumerate(entries, start=1):
         if not isinstance(faces, list) or not faces or not all(_is_face(face) for face in faces):
-            raise UserError(f"{path}, solid {number}: give a list of faces, each four numbers [nx, ny, nz, d]")
+            wrong = next((face for face in faces if not _is_face(face)), faces) if isinstance(faces, list) else faces
+            raise UserError(
+                f"{path}, solid {number}: it contains {json_excerpt(wrong)}; give a list of faces, each four"
+                " numbers [nx, ny, nz, d]"
+            )
         try:
             solids.append(Solid(tuple(Plane.from_coefficients(*face) for face in faces)))
         except UserError as error:

@@ -34,22 +34,37 @@ class RigidPath:
 
     def __post_init__(self) -> None:
         times, shifts, turns = self._arrays()
-        if len(times) < 2 or not (np.diff(times) > 0.0).all() or not np.isfinite(times).all():
-            raise UserError("path: give at least one point, and ascending times above 0 s")
+        if len(times) < 2:
+            raise UserError("path: it has no points; give at least one")
+        for number in range(1, len(times)):
+            if not times[number - 1] < times[number] < np.inf:
+                raise UserError(
+                    f"path: time {number} is {times[number]:g} s, and the one before it {times[number - 1]:g} s; give"
+                    " finite, ascending times above 0 s"
+                )
         if len(shifts) != len(times) or len(turns) != len(times):
-            raise UserError("path: give one shift for each time, and either no turns or one for each time")
-        if not (np.isfinite(shifts).all() and np.isfinite(turns).all()):
-            raise UserError("path: give finite shifts and turns")
+            raise UserError(
+                f"path: the numbers of times, shifts and turns are {len(times) - 1}, {len(shifts) - 1} and"
+                f" {len(turns) - 1}; give one shift for each time, and either no turns or one for each time"
+            )
+        for name, values in (("shift", shifts), ("turn", turns)):
+            for number, value in enumerate(values):
+                if not np.isfinite(value).all():
+                    raise UserError(f"path: {name} {number} is {value.tolist()}; give finite numbers")
         if self.repeat and (shifts[-1].any() or turns[-1] % 360.0 != 0.0):
-            raise UserError("path: a path that is repeated must end where it starts; add the start as its last point")
+            raise UserError(
+                f"path: it ends with the shift {shifts[-1].tolist()} and the turn {turns[-1]:g}, but a path that is"
+                " repeated must end where it starts; add the start as its last point"
+            )
 
     def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the times (K + 1,), translations (K + 1, 3) and rotations (K + 1,) of all points, including the
         start."""
         turns = np.zeros(len(self.times)) if self.turns is None else np.asarray(self.turns, float)
         shifts = [np.zeros(3), *(np.asarray(shift, float) for shift in self.shifts)]
-        if any(shift.shape != (3,) for shift in shifts):
-            raise UserError("path: give three numbers for each shift")
+        for number, shift in enumerate(shifts):
+            if shift.shape != (3,):
+                raise UserError(f"path: shift {number} has shape {shift.shape}; give three numbers (x, y, z)")
         return np.append(0.0, self.times), np.array(shifts), np.append(0.0, turns)
 
     @property

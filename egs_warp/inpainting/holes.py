@@ -98,7 +98,10 @@ def disc(plane: Plane, centre: np.ndarray, radius: float) -> Hole:
     Raises ``UserError`` unless the radius is positive.
     """
     if not (np.isfinite(radius) and radius > 0.0 and np.isfinite(centre).all()):
-        raise UserError(f"inpaint: the hole's radius {radius:g} must be a positive number and its centre finite")
+        raise UserError(
+            f"inpaint: the hole has the radius {radius:g} and the centre {','.join(f'{x:g}' for x in centre)}; give a"
+            " positive radius and a finite centre"
+        )
     window = _window(plane, np.asarray(centre, float), 2.0 * radius)
     columns, rows = np.meshgrid(np.arange(_TEXELS) + 0.5, np.arange(_TEXELS) + 0.5)
     return Hole(window, np.hypot(columns - 0.5 * _TEXELS, rows - 0.5 * _TEXELS) * window.texel < radius)

@@ -200,8 +200,8 @@ def inpaint(
     )
     if new is None:
         raise UserError(
-            f"inpaint: the hole is too narrow: none of its {int(grown.sum())} texels lie in a block of {spacing} x"
-            f" {spacing}, the spacing of new Gaussians; make it wider"
+            f"inpaint: the hole is too narrow: its {int(grown.sum())} texels fill no more than half of any block of"
+            f" {spacing} x {spacing} texels, and each new Gaussian needs more; make it wider"
         )
     new = replace(new, antialiased=background.antialiased)
     if options.steps > 0:
@@ -214,7 +214,7 @@ def inpaint(
     floor = near_plane(retained, window.plane, thickness) & (retained.opacities() > _SOLID)
     if not floor.any():
         raise UserError(
-            f"inpaint: no floor is left around the hole: none of the {retained.count} remaining Gaussians within"
+            f"inpaint: no floor is left around the hole: {retained.count} Gaussians remain, but none within"
             f" {thickness:.3g} scene units of the plane is more opaque than {_SOLID:g}; make the hole smaller or check"
             " plane and hole"
         )

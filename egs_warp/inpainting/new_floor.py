@@ -70,8 +70,8 @@ def flat_gaussians(
 ) -> GaussianCloud | None:
     """Create flat Gaussians of SH degree 0 over a hole and its known rim.
 
-    The Gaussians over the rim lie a little lower, so that they are visible only through gaps. Returns None if no block
-    of ``spacing`` x ``spacing`` texels fits into the hole.
+    The Gaussians over the rim lie a little lower, so that they are visible only through gaps. Returns None if the
+    hole fills no more than half of any block of ``spacing`` x ``spacing`` texels.
 
     Args:
         window: the plane and its grid of texels.

@@ -94,7 +94,7 @@ def _placed(
         transforms = whole[None] if instancing is None else whole @ _instances(instancing["attributes"], accessor)
         sizes = np.linalg.svd(np.nan_to_num(transforms[:, :3, :3], nan=0.0, posinf=0.0, neginf=0.0), compute_uv=False)
         if not np.isfinite(transforms).all() or (sizes[:, 2] <= _FLAT * sizes[:, 0]).any():
-            raise UserError(f"{source}: the transform of a node is singular or not finite; export it again")
+            raise UserError(f"{source}: the transform of node {number} is singular or not finite; export it again")
         found.append(Placement(mesh, transforms))
     return found
 

@@ -137,8 +137,10 @@ def _intrinsics(entry: _Entry) -> tuple[dict, Lens | None]:
         name: _calibration_number(sensor, name)
         for name in ("f", "fx", "fy", "cx", "cy", "b1", "k1", "k2", "k3", "k4", "p1", "p2")
     }
-    if not np.isfinite(list(number.values())).all() or width < 1 or height < 1:
-        raise UserError(f"{entry.where} has a sensor with invalid numbers; {_EXPORT}")
+    wrong = [name for name, value in number.items() if not np.isfinite(value)]
+    if wrong or width < 1 or height < 1:
+        what = f"{', '.join(wrong)} not finite" if wrong else f"{width} x {height} pixels"
+        raise UserError(f"{entry.where} has a sensor with invalid numbers ({what}); {_EXPORT}")
     # Files of versions up to 1.2 have two focal lengths, the position of the principal point instead of its offset from
     # the middle, and p1 and p2 in OpenCV's order.
     is_old = calibration.find("fx") is not None

@@ -103,7 +103,7 @@ def read_picked(path: Path | str, cloud: GaussianCloud) -> PickedFile:
     objects = tuple(_from_json(entry, path, number, cloud.count) for number, entry in enumerate(entries, start=1))
     selected = tree.get("selected", 0)
     if isinstance(selected, bool) or not isinstance(selected, int) or not 0 <= selected < len(objects):
-        raise UserError(f"{path}: selected must be a number from 0 to {len(objects) - 1}; correct it")
+        raise UserError(f"{path}: selected is {str(selected)[:20]}; give a number from 0 to {len(objects) - 1}")
     return PickedFile(name, objects, selected)
 
 
@@ -125,7 +125,10 @@ def _from_json(entry: Any, path: Path, number: int, count: int) -> PickedObject:
         raise UserError(f"{path}: object {number} needs name, plane and gaussians; {_REMEDY}")
     name = entry["name"]
     if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME_LENGTH:
-        raise UserError(f"{path}: object {number} needs a name of 1 to {MAX_NAME_LENGTH} characters; correct it")
+        raise UserError(
+            f"{path}: the name of object {number} is {str(name)[:80]!r}; give a text of 1 to {MAX_NAME_LENGTH}"
+            " characters"
+        )
     size = -(-count // 8)
     try:
         # Limit the size of the result, because a few bytes can expand beyond the available memory.
@@ -144,7 +147,9 @@ def _from_json(entry: Any, path: Path, number: int, count: int) -> PickedObject:
             front = direction_of(np.array(entry["front"], dtype=float), "front")
             front = front / np.linalg.norm(front)
         except (TypeError, ValueError, OverflowError):
-            raise UserError(f"{path}: the front of {name!r} must be three numbers, not all zero; correct it") from None
+            raise UserError(
+                f"{path}: the front of {name!r} is {str(entry['front'])[:60]}; give three numbers, not all zero"
+            ) from None
     return PickedObject(name, gaussians, PlaneRecord.from_json(entry["plane"], path, number), front)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -101,21 +102,28 @@ def read_header(data: bytes, source: Path) -> PlyHeader:
             case _:
                 shown = line[:60].decode("latin-1").strip()
                 raise UserError(f"{source}: malformed .ply header, line {shown!r}; export the file again")
-    names = [name for name, _, _ in elements]
-    if len(set(names)) < len(names):
-        raise UserError(f"{source}: malformed .ply header, an element occurs twice; export the file again")
+    twice = _repeated([name for name, _, _ in elements])
+    if twice is not None:
+        raise UserError(f"{source}: malformed .ply header, element {twice} occurs twice; export the file again")
     if byte_order == "":
         raise UserError(f"{source}: malformed .ply header, no format line; export the file again")
     declared = tuple(_element(source, byte_order, *element) for element in elements)
     return PlyHeader(byte_order, declared, end.end(), tuple(comments))
 
 
+def _repeated(names: list[str]) -> str | None:
+    """Return the first name that occurs more than once; None if there is none."""
+    return next((name for name, count in Counter(names).items() if count > 1), None)
+
+
 def _element(
     source: Path, byte_order: str | None, name: str, count: int, properties: list[tuple[str, str | None]]
 ) -> PlyElement:
-    names = [property_name for property_name, _ in properties]
-    if len(set(names)) < len(names):
-        raise UserError(f"{source}: malformed .ply header, element {name} repeats a property; export the file again")
+    twice = _repeated([property_name for property_name, _ in properties])
+    if twice is not None:
+        raise UserError(
+            f"{source}: malformed .ply header, element {name} repeats property {twice}; export the file again"
+        )
     if any(kind is None for _, kind in properties):
         return PlyElement(name, count, None)
     return PlyElement(name, count, np.dtype([(n, f"{byte_order or '<'}{kind}") for n, kind in properties]))
@@ -344,7 +352,7 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     rows = read_elements(data, read_header(data, path), ["vertex"], path).get("vertex")
     names = () if rows is None else rows.dtype.names or ()
     if rows is None or not {"x", "y", "z"} <= set(names):
-        raise UserError(f"{path}: it has no points x, y, z; export it again")
+        raise UserError(f"{path}: it has no vertices with x, y and z; export it again")
     positions = np.stack([rows[name] for name in ("x", "y", "z")], axis=1).astype(float)
     colours = np.full(positions.shape, 0.5)
     if {"red", "green", "blue"} <= set(names):

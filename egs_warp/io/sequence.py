@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 
 from egs_warp.errors import UserError
@@ -79,7 +80,8 @@ def numbered_captures(folder: Path | str) -> list[Path]:
     if len(kinds) > 1:
         names = " and ".join(f"{prefix}0001{ending}" for prefix, ending in kinds[:2])
         raise UserError(f"{folder}: it has two sequences ({names}); put each into a folder of its own")
-    numbers = [int(match["number"]) for match, _ in found]
-    if len(set(numbers)) != len(numbers):
-        raise UserError(f"{folder}: two of its captures have the same number; remove one of them")
-    return [path for _, (_, path) in sorted(zip(numbers, found, strict=True), key=lambda pair: pair[0])]
+    ordered = sorted((int(match["number"]), path) for match, path in found)
+    for (number, path), (following, other) in pairwise(ordered):
+        if number == following:
+            raise UserError(f"{folder}: {path.name} and {other.name} have the same number; remove one of them")
+    return [path for _, path in ordered]

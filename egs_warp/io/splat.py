@@ -41,8 +41,8 @@ def decode_splat(data: bytes, source: Path) -> RawCapture:
     negative = np.flatnonzero((scales < 0).any(axis=1))
     if len(negative) > _MAX_NEGATIVE * len(rows):
         raise UserError(
-            f"{source}: scale of {len(negative)} Gaussians is negative (first: number {negative[0]}); "
-            "if the file is a .splat, export it again"
+            f"{source}: {len(negative)} Gaussians have a negative scale (the first is number {negative[0]}), so the"
+            " file is damaged or not a .splat; export it again"
         )
     # In float32, exp is 0 below about -104, so Gaussians with smaller log scales are stored with scale 0.
     zero = int(np.count_nonzero((scales == 0).any(axis=1)))

@@ -24,8 +24,11 @@ def decode_streamed_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
     names, tree = meta.entry("filenames"), meta.entry("tree")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not isinstance(tree, dict):
         raise UserError(f"{files.source}: lod-meta.json has no filenames and tree; export the capture again")
-    if len({PurePosixPath(name) for name in names}) < len(names):
-        raise UserError(f"{files.source}: lod-meta.json names a file twice; export the capture again")
+    seen: set[PurePosixPath] = set()
+    for name in names:
+        if PurePosixPath(name) in seen:
+            raise UserError(f"{files.source}: lod-meta.json names {name!r} twice; export the capture again")
+        seen.add(PurePosixPath(name))
     ranges: dict[int, list[tuple[int, int]]] = {}
     for file, start, count in _leaves(tree, files):
         if file >= len(names):

@@ -16,6 +16,8 @@ _EXACT_DIGITS = 15
 """Maximum number of digits at which every integer is exact as a float."""
 MAX_NESTING = 100
 """Maximum depth of nested lists and objects in a file."""
+_MAX_EXCERPT = 60
+"""Maximum number of characters of an invalid value in a message."""
 _STRING_OR_BRACKET = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"?|[\[\]{}]', re.DOTALL)
 """Pattern of a JSON string, which may be cut off, or of a bracket outside strings."""
 
@@ -89,3 +91,9 @@ def parse_json(text: str, path: Path | str) -> Any:
         raise UserError(f"{path}: not JSON at line {error.lineno} ({error.msg}); correct that line") from None
     except ValueError:
         raise UserError(f"{path}: its lists are nested too deeply; write fewer levels") from None
+
+
+def json_excerpt(value: Any) -> str:
+    """Return a value of a JSON file as text for a message, cut to ``_MAX_EXCERPT`` characters."""
+    text = json.dumps(value)
+    return text if len(text) <= _MAX_EXCERPT else f"{text[:_MAX_EXCERPT]} ..."

@@ -122,7 +122,10 @@ def _meshes(tree: Mapping[str, Any], binary: bytes, source: Path) -> list[Triang
             indices = accessor(primitive["indices"]) if "indices" in primitive else np.arange(len(points))[:, None]
             faces = indices.astype(np.int64).reshape(-1, 3)
             if not np.isfinite(points).all() or faces.max() >= len(points):
-                raise UserError(f"{source}: a mesh has an invalid vertex or index; export it again")
+                raise UserError(
+                    f"{source}: mesh {placed.mesh} has a vertex that is not finite, or a triangle of a vertex that is"
+                    f" missing (index {faces.max()} of {len(points)}); export it again"
+                )
             total += len(faces) * len(placed.transforms)
             if total > _MAX_TRIANGLES:
                 raise UserError(f"{source}: more than {_MAX_TRIANGLES} triangles; simplify the mesh")

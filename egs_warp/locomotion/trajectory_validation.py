@@ -75,17 +75,20 @@ def check_trajectory(t: Trajectory) -> None:
     for name in t.__dataclass_fields__:
         values = np.asarray(getattr(t, name))
         if values.dtype.kind not in "iuf":
-            raise ValueError(f"{name} is not numeric")
+            raise ValueError(f"{name} has type {values.dtype}, not numbers")
         if name not in _MAY_BE_NAN and not (np.abs(values) <= MAX_COORDINATE).all():
-            raise ValueError(f"{name} has values that are too large or not finite")
+            raise ValueError(f"{name} has values that are too large or not finite (limit {MAX_COORDINATE:g})")
         if name in _POSITIVE and not (values > 0.0).all():
-            raise ValueError(f"{name} is not positive")
+            raise ValueError(f"{name} is not positive (minimum {values.min():g})")
     for name, below in _INDICES.items():
         values, least = getattr(t, name), -MAX_BODIES if name == "contact_plane" else 0
-        if values.dtype.kind not in "iu" or (
-            values.size and not least <= values.min() <= values.max() < extents[below]
-        ):
-            raise ValueError(f"{name} has an index out of range")
+        if values.dtype.kind not in "iu":
+            raise ValueError(f"{name} has type {values.dtype}, not integers")
+        if values.size and not least <= values.min() <= values.max() < extents[below]:
+            raise ValueError(
+                f"{name} has an index out of range ({values.min()} to {values.max()}, allowed {least} to"
+                f" {extents[below] - 1})"
+            )
     starts = t.muscle_end_starts
     if (
         starts.dtype.kind not in "iu"
@@ -93,9 +96,12 @@ def check_trajectory(t: Trajectory) -> None:
         or starts[-1] != extents["entries"]
         or (np.diff(starts) < 0).any()
     ):
-        raise ValueError("muscle_end_starts has an index out of range")
-    if (np.diff(t.time) <= 0.0).any() or t.time[-1] - t.time[0] > MAX_DURATION:
-        raise ValueError("time does not increase from step to step, or spans more than a day")
+        raise ValueError(f"muscle_end_starts are not ascending integers from 0 to {extents['entries']}")
+    if (np.diff(t.time) <= 0.0).any():
+        step = int(np.argmax(np.diff(t.time) <= 0.0))
+        raise ValueError(f"time does not increase in step {step}, from {t.time[step]:g} to {t.time[step + 1]:g} s")
+    if t.time[-1] - t.time[0] > MAX_DURATION:
+        raise ValueError(f"time spans more than a day, {t.time[-1] - t.time[0]:g} s")
     for name in ("rest_positions", "unloaded_positions"):
         if not (TetMesh(getattr(t, name), t.tets).volumes() > 0.0).all():
             raise ValueError(f"tets have no positive volume in {name}")
@@ -104,7 +110,7 @@ def check_trajectory(t: Trajectory) -> None:
     if np.abs(t.body_axes @ t.body_axes.T - np.eye(3)).max() > 1e-6:
         raise ValueError("body_axes are not orthonormal")
     if abs(np.linalg.norm(t.front) - 1.0) > 1e-6 or abs(t.front[2]) > 1e-6:
-        raise ValueError("front is not a unit vector along the ground")
+        raise ValueError(f"front {t.front.tolist()} is not a horizontal unit vector")
 
 
 def _extents(t: Trajectory) -> dict[str, int]:
@@ -120,7 +126,10 @@ def _extents(t: Trajectory) -> dict[str, int]:
     extents["ends"] = extents["offsets"] - 1
     is_wrong = extents["states"] != extents["steps"] + 1 or extents["planned"] not in (0, extents["states"])
     if is_wrong or min(extents[name] for name in ("nodes", "tets", "planes", "offsets")) < 1:
-        raise ValueError("its arrays have inconsistent shapes")
+        counts = ", ".join(
+            f"{extents[name]} {name}" for name in ("states", "steps", "planned", "nodes", "tets", "planes", "offsets")
+        )
+        raise ValueError(f"its arrays have inconsistent shapes: {counts}")
     if t.relative_stiffness.shape not in ((0,), (extents["tets"],)):
         raise ValueError(f"relative_stiffness has shape {t.relative_stiffness.shape}, expected ({extents['tets']},)")
     # ``kick_velocity`` may be absent if the run has no pushes.

@@ -94,9 +94,11 @@ class ContactShape:
         """Raise ``ValueError`` for arrays that are not those of a shape."""
         count = len(self.point_tets)
         if self.point_weights.shape != (count, 4) or self.point_tets.shape != (count,):
-            raise ValueError("its contact points and their weights differ in number")
+            shapes = f"{self.point_tets.shape} and {self.point_weights.shape}"
+            raise ValueError(f"its contact points and their weights have shapes {shapes}, expected (P,) and (P, 4)")
         if self.rest_positions.shape[1:] != (3,) or self.origin.shape != (3,) or self.coefficients.ndim != 3:
-            raise ValueError("the shapes of its rest positions, origin or coefficients are wrong")
+            shapes = f"{self.rest_positions.shape}, {self.origin.shape} and {self.coefficients.shape}"
+            raise ValueError(f"its rest positions, origin and coefficients have the wrong shapes {shapes}")
         if min(self.coefficients.shape) < 3 or not (np.isfinite(self.coefficients).all() and self.spacing > 0.0):
             raise ValueError("its level set is invalid")
 

@@ -45,8 +45,12 @@ def read_cage_mesh(path: Path) -> TetMesh:
         raise UserError(f"{path}: cannot be read as a mesh ({reason[0][:200]}); write it again") from error
     if not MIN_NODES <= len(nodes) <= MAX_NODES:
         raise UserError(f"{path}: its tetrahedra have {len(nodes)} nodes; give a mesh with {MIN_NODES} to {MAX_NODES}")
-    if nodes.shape[1] != 3 or not (np.abs(nodes) <= MAX_COORDINATE).all():
-        raise UserError(f"{path}: a node does not have three finite coordinates; write it again")
+    is_valid = (np.abs(nodes) <= MAX_COORDINATE).all(axis=1) & (nodes.shape[1] == 3)
+    if not is_valid.all():
+        raise UserError(
+            f"{path}: a node is at {nodes[np.argmin(is_valid)].tolist()}; give three finite coordinates, at most"
+            f" {MAX_COORDINATE:g}"
+        )
     corners = nodes[tets]
     volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
     turned = volumes <= 0.0 if np.median(volumes) > 0.0 else volumes >= 0.0

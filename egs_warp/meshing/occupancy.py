@@ -135,8 +135,8 @@ def _solid_within(
     if not occupied.any():
         raise UserError(
             f"object: nothing opaque stands on the plane (of {cloud.count} Gaussians, {int(np.sum(means[:, 2] > 0))} "
-            f"are above it; the largest opacity is {opacities.max():.2g}); check the plane and the object",
-            check=("plane", "up"),
+            f"are above it; the largest opacity is {opacities.max():.2g})",
+            check=("plane", "up", "object"),
         )
     node = np.rint(means / spacing).astype(int) - corner
     in_lattice = np.all((node >= 0) & (node < counts), axis=1)

@@ -57,8 +57,11 @@ class DrivePlan:
                     "time", f"give increasing times in seconds, from 0 to {MAX_TIME:g}", value=f"{time:g}"
                 )
             before = time
-        if not self.commands or not self.commands[-1].is_zero:
-            raise ArgumentError("commands", "the last command is not zero; end with 0,0,0")
+        if not self.commands:
+            raise ArgumentError("commands", "the list is empty; end with 0,0,0")
+        if not self.commands[-1].is_zero:
+            speeds = ",".join(f"{speed:g}" for speed in vars(self.commands[-1]).values())
+            raise ArgumentError("commands", f"the last command is {speeds}, not zero; end with 0,0,0")
 
     def at(self, elapsed: float) -> Drive:
         """Return the command that is valid ``elapsed`` seconds after the start."""

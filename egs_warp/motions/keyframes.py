@@ -21,7 +21,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from egs_warp.errors import UserError, did_you_mean
-from egs_warp.io.text import parse_json, read_text
+from egs_warp.io.text import json_excerpt, parse_json, read_text
 
 
 class Quantity(Enum):
@@ -147,9 +147,8 @@ def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
         before, what = (group[-1].time, "the previous key") if group else (0.0, "the start")
         if round(key.time - before, 9) < MIN_GAP:
             raise UserError(
-                f"{key.where}: time {key.time:g} is less than {MIN_GAP:g} s after {what} of {key.part}"
-                f" {key.quantity.value} at {before:g} s; give keys in the order of their times, at least {MIN_GAP:g} s"
-                " apart"
+                f"{key.where} ({key.part} {key.quantity.value}): time {key.time:g} s is less than {MIN_GAP:g} s after"
+                f" {what} at {before:g} s; sort the keys by time and leave at least {MIN_GAP:g} s between them"
             )
         group.append(key)
     return tuple(
@@ -167,12 +166,15 @@ def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
 def _from_json(text: str, path: Path) -> list[Key]:
     entries = parse_json(text, path)
     if not isinstance(entries, list):
-        raise UserError(f"{path}: give a list of keys, each an object with {', '.join(_FIELDS[:4])}")
+        found = json_excerpt(entries)
+        raise UserError(
+            f"{path}: it contains {found}; give a list of keys, each an object with {', '.join(_FIELDS[:4])}"
+        )
     keys = []
     for number, entry in enumerate(entries, start=1):
         where = f"{path}, key {number}"
         if not isinstance(entry, dict):
-            raise UserError(f"{where}: {entry!r} is not an object with {', '.join(_FIELDS[:4])}")
+            raise UserError(f"{where} is {json_excerpt(entry)}; give an object with {', '.join(_FIELDS[:4])}")
         keys.append(_key(entry, where))
     return keys
 

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
-from egs_warp.io.text import parse_json, read_text, whole_number
+from egs_warp.io.text import json_excerpt, parse_json, read_text, whole_number
 from egs_warp.motions.beats import parse_beats
 from egs_warp.motions.command import Drive, DrivePlan
 from egs_warp.motions.keyframes import Key, checked_keys
@@ -261,12 +261,14 @@ def _from_words(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRe
 def _from_json(path: Path, defaults: Mapping[str, Any]) -> list[MotionRequest]:
     entries = parse_json(read_text(path), path)
     if not isinstance(entries, list) or not entries:
-        raise UserError(f'{path}: give a list of motions, such as [{{"motion": "jump"}}]')
+        found = json_excerpt(entries)
+        raise UserError(f'{path}: it contains {found}; give a list of motions, such as [{{"motion": "jump"}}]')
     requests = []
     for number, entry in enumerate(entries, start=1):
         where = f"{path}, motion {number}"
         if not isinstance(entry, dict) or not isinstance(entry.get("motion"), str):
-            raise UserError(f'{where}: give an object with a "motion", one of {_NAMES}')
+            found = json_excerpt(entry)
+            raise UserError(f'{where} is {found}; give an object with a "motion", one of {_NAMES}')
         values = dict(entry)
         name = values.pop("motion")
         repeat = values.pop("repeat", 1)
@@ -292,7 +294,10 @@ def _layers_from_json(entries: Any, where: str) -> tuple[LayerRequest, ...]:
     layers = []
     for entry in entries:
         if not isinstance(entry, dict) or not isinstance(entry.get("motion"), str):
-            raise UserError(f'{where}: give a "motion" for each gesture of "with", one of {", ".join(_GESTURES)}')
+            raise UserError(
+                f'{where}: "with" contains {json_excerpt(entry)}; give a "motion" for each gesture, one of'
+                f" {', '.join(_GESTURES)}"
+            )
         values = dict(entry)
         name, begin = values.pop("motion"), values.pop("at", 0.0)
         layers.append(_layer(_request(name, values, 1, None, {}, where), begin, where))

@@ -152,9 +152,7 @@ class BalanceController:
         """(P, N) shares of the nodes in the mass of the body, of its base and of each sole."""
         self._standing = standing
         if len(contact_points) == 0:
-            raise UserError(
-                "body: no point of the body is on the ground at the start; check the ground", check=("plane", "up")
-            )
+            raise UserError("body: no point of the body is on the ground at the start", check=("plane", "up"))
         footprint = ground.local(contact_points)[:, :2] - com[:2]
         # Include a small square, because the centre of mass of a standing body lies in its footprint even if few points
         # are in contact.

@@ -89,7 +89,10 @@ class Walk:
         body = stance.body
         feet, posture = select_posture(stance)
         if not feet:
-            raise UserError("walk: the body has neither feet nor a flat base with a side that it could lift")
+            raise UserError(
+                "walk: the body has neither feet nor a flat base with a side that it could lift; jump, hop or twist"
+                " instead"
+            )
         self.body, self.ground = body, stance.ground
         self.control, self._crouch = control or WalkControl(), crouch
         self._shift_time = 0.0 if skips_shift else _SHIFT_TIME

@@ -28,7 +28,7 @@ from egs_warp.errors import UserError, did_you_mean
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
-from egs_warp.io.text import parse_json, read_text
+from egs_warp.io.text import json_excerpt, parse_json, read_text
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres
 
@@ -147,7 +147,7 @@ def _longitudinal(where: str, entry: dict[str, Any]) -> list[np.ndarray]:
 def _polyline(where: str, entry: dict[str, Any]) -> list[np.ndarray]:
     points = entry.get("points")
     if not isinstance(points, list) or len(points) < 2:
-        raise UserError(f'{where}: "points" must be a list of at least two points [x, y, z]')
+        raise UserError(f'{where}: "points" is {json_excerpt(points)}; give a list of at least two points [x, y, z]')
     return [np.array([_point(f"{where}, point {number + 1}", {"": point}, "") for number, point in enumerate(points)])]
 
 
@@ -183,7 +183,7 @@ def _mirror(where: str, content: dict[str, Any]) -> Callable[[np.ndarray], np.nd
         return None
     plane = content["mirror_plane"]
     if not isinstance(plane, dict):
-        raise UserError(f'{where}: "mirror_plane" must be an object with "point" and "normal"')
+        raise UserError(f'{where}: "mirror_plane" is {json_excerpt(plane)}; give an object with "point" and "normal"')
     where = f"{where}: mirror_plane"
     _refuse_unknown_keys(where, plane, {"point", "normal"})
     point, normal = _point(where, plane, "point"), _direction(where, plane, "normal")
@@ -206,8 +206,10 @@ def _check(path: Path, fibres: list[Fibre], mesh: TetMesh, frame: BodyFrame) -> 
                 f"{where}: the point [{x:g}, {y:g}, {z:g}] is {distances[worst] / frame.scale:.3g} units away"
                 " from the body; give points inside it, in the capture's own coordinates"
             )
-        if np.linalg.norm(np.diff(fibre.points, axis=0), axis=1).min() == 0.0:
-            raise UserError(f"{where} has two equal points in a row; remove one")
+        lengths = np.linalg.norm(np.diff(fibre.points, axis=0), axis=1)
+        if lengths.min() == 0.0:
+            x, y, z = frame.capture_points(fibre.points[int(np.argmin(lengths))])
+            raise UserError(f"{where} has two equal points in a row, [{x:g}, {y:g}, {z:g}]; move one of them")
     count = sum(len(fibre.points) - 1 for fibre in fibres)
     if count > MAX_SEGMENTS:
         raise UserError(f"{path}: its fibres have {count} segments in all; use at most {MAX_SEGMENTS}")

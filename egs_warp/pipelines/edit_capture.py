@@ -151,7 +151,11 @@ def edit_capture(capture: Capture, edits: CaptureEdits) -> tuple[Capture, tuple[
             bounds = " to ".join(
                 ",".join(f"{x:.6g}" for x in corner) for corner in (means.min(axis=0), means.max(axis=0))
             )
-            raise ArgumentError("box", f"none of the {cloud.count} Gaussians lies in it; they extend from {bounds}")
+            raise ArgumentError(
+                "box",
+                f"none of the {cloud.count} Gaussians lies in it; they extend from {bounds}, so give a box that"
+                " contains some of them",
+            )
         lines.append(f"box: {cloud.count - int(inside.sum())} of {cloud.count} Gaussians left out")
         cloud = cloud.subset(inside)
     if edits.drop_floaters:

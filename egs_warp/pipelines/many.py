@@ -158,9 +158,12 @@ def simulate_many(
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     kind = WorldJob if isinstance(creature, World) else Job
-    if not all(isinstance(job, kind) for job in jobs):
-        owner = "a world" if isinstance(creature, World) else "a creature"
-        raise ArgumentError("jobs", f"give only egs.{kind.__name__}, the jobs of {owner}")
+    for number, job in enumerate(jobs):
+        if not isinstance(job, kind):
+            owner = "a world" if isinstance(creature, World) else "a creature"
+            raise ArgumentError(
+                "jobs", f"job {number} is a {type(job).__name__}; give only egs.{kind.__name__}, the jobs of {owner}"
+            )
     if isinstance(creature, World):
         if worlds is not None:
             raise ArgumentError("worlds", "batches are for one creature; leave it out", value=worlds)

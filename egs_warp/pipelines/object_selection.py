@@ -158,7 +158,7 @@ def _parse_location(
     except ValueError:
         raise UserError(f"{names.object} {text}: this is neither a file nor numbers; {names.help}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
-        raise UserError(f"{names.object} {text}: these are {len(numbers)} numbers; {names.help}")
+        raise UserError(f"{names.object} {text}: these are not three or six finite numbers; {names.help}")
     if np.abs(numbers).max() > MAX_COORDINATE:
         raise UserError(f"{names.object} {text}: further than {MAX_COORDINATE:g} units from the origin; {names.help}")
     if len(numbers) == 3:
@@ -197,7 +197,10 @@ def _click(
     if one.lens is not None:
         x, y = Undistortion.of(camera, one.lens).pixel(x, y)
     if not (0.0 <= x < camera.width and 0.0 <= y < camera.height):
-        raise UserError(f"{names.object} {text}: outside of the {camera.width} x {camera.height} pixels of the view")
+        raise UserError(
+            f"{names.object} {text}: outside of the {camera.width} x {camera.height} pixels of the view; give a pixel"
+            " inside"
+        )
     click = click_at(cloud, camera, x, y, inside=inside)
     if click is None:
         raise UserError(f"{names.object} {text}: no Gaussian is visible at this pixel; click on the object")

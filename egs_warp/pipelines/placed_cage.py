@@ -54,7 +54,7 @@ def plane_below(cloud: GaussianCloud, ground: HeightField) -> Plane:
     means = cloud.means.numpy()[cloud.opacities() > 0.3].astype(np.float64)
     heights = ground.heights(means)
     if len(means) == 0 or not (heights > 0.0).any():
-        raise ArgumentError("ground", "no part of the object lies above it; check the plane", check=("plane",))
+        raise ArgumentError("ground", "no part of the object lies above it", check=("plane",))
     low = means[(heights > 0.0) & (heights < _FOOT_HEIGHT * float(np.quantile(heights, 0.99)))]
     lift = float(ground.ground_height(low).min()) if len(low) else 0.0
     return Plane(ground.normal, ground.plane.offset - lift)

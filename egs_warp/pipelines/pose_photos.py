@@ -118,7 +118,7 @@ def pose_photos(
     report = progress or (lambda _stage, _done, _of: None)
     is_video = source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES
     if not source.is_dir() and not is_video:
-        raise UserError(f"{source}: neither a folder of photos nor a video ({', '.join(VIDEO_SUFFIXES)})")
+        raise UserError(f"{source}: neither a folder of photos nor a video ({', '.join(VIDEO_SUFFIXES)}); give one")
     check_run_folder(out, overwrite=overwrite, writes=_WRITES)
     with run_folder(out, command="pose", overwrite=overwrite) as run, _work_folder(run.path, resume) as work:
         images = work / "images"

@@ -157,18 +157,27 @@ class RenderData:
         if (camera.rotation.shape, camera.translation.shape) != ((3, 3), (3,)) or not (
             abs(numbers) <= MAX_COORDINATE
         ).all():
-            raise ValueError("the position or rotation of its camera is invalid")
+            shapes = f"{camera.rotation.shape} and {camera.translation.shape}"
+            raise ValueError(
+                "its camera has numbers that are too large or not finite, or rotation and translation of the wrong"
+                f" shapes {shapes}"
+            )
         lengths = np.array([camera.fx, camera.fy, camera.near, camera.far - camera.near])
         if not (lengths > 0.0).all() or lengths.max() > MAX_COORDINATE or min(camera.width, camera.height) < 1:
-            raise ValueError("the focal lengths or clipping planes of its camera are invalid")
+            raise ValueError(
+                f"its camera has fx {camera.fx:g}, fy {camera.fy:g}, near {camera.near:g}, far {camera.far:g} and"
+                f" {camera.width} x {camera.height} pixels, which are not possible together"
+            )
         count = len(self.muscle_bounds)
         _check_rows("muscle_segments", self.muscle_segments, (count, 2), 0, len(ends.indptr) - 1)
         _check_rows("fibre_from_segment", self.fibre_from_segment, (count,), 0, len(self.fibre_names))
         _check_rows("foot_from_node", self.foot_from_node, (node_count,), -1, node_count)
         if len(self.fibre_names) != len(self.fibre_kinds):
-            raise ValueError("fibre_names and fibre_kinds differ in length")
-        if self.muscle_bounds.shape != (count,) or not np.isfinite(self.muscle_bounds).all():
-            raise ValueError("muscle_bounds has a wrong shape or values that are not finite")
+            raise ValueError(f"{len(self.fibre_names)} fibre_names, but {len(self.fibre_kinds)} fibre_kinds")
+        if self.muscle_bounds.shape != (count,):
+            raise ValueError(f"muscle_bounds has shape {self.muscle_bounds.shape}, expected ({count},)")
+        if not np.isfinite(self.muscle_bounds).all():
+            raise ValueError("muscle_bounds has values that are not finite")
         if not (np.abs(ends.data) <= MAX_COORDINATE).all():
             raise ValueError("muscle_end_weights has values that are too large or not finite")
 
@@ -189,4 +198,6 @@ def _check_rows(name: str, values: np.ndarray, shape: tuple[int, ...], minimum: 
     if values.shape != shape or values.dtype.kind not in "iu":
         raise ValueError(f"{name} has shape {values.shape} of {values.dtype}, expected integers of shape {shape}")
     if values.size and not minimum <= values.min() <= values.max() < below:
-        raise ValueError(f"{name} has an index out of range")
+        raise ValueError(
+            f"{name} has an index out of range ({values.min()} to {values.max()}, allowed {minimum} to {below - 1})"
+        )

@@ -15,7 +15,7 @@ from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.camera import Camera, fitted_camera
 from egs_warp.geometry.frames import box_corners
-from egs_warp.io.text import parse_json, read_text
+from egs_warp.io.text import json_excerpt, parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
 
 if TYPE_CHECKING:
@@ -243,12 +243,13 @@ def _through_keys(path: Path, camera: Camera, trajectory: FilmedMotion, steps: n
     times = np.clip(trajectory.time[steps] - trajectory.time[0], rows[0, 0], rows[-1, 0])
     line = CubicSpline(rows[:, 0], rows[:, 1:])(times) if len(rows) > 1 else np.repeat(rows[:, 1:], len(times), axis=0)
     cameras = []
-    for row in line:
+    for time, row in zip(times, line, strict=True):
         eye, target = row[:3], row[3:6]
         forward = target - eye
         if np.linalg.norm(np.cross(forward, [0.0, 0.0, 1.0])) < 1e-6 * max(np.linalg.norm(forward), 1e-12):
             raise UserError(
-                f"{path}: its camera points straight up or down, or its eye and target coincide; move a key"
+                f"{path}: at {time:g} s, its camera points straight up or down, or its eye and target coincide; move a"
+                " key"
             )
         fov = float(np.clip(row[6], 1.0, 150.0))
         cameras.append(
@@ -270,10 +271,17 @@ def _keys(path: Path) -> np.ndarray:
     keys = parse_json(read_text(path), path)
     entries = keys.get("keys") if isinstance(keys, dict) else None
     if not isinstance(entries, list) or not entries:
-        raise UserError(f'{path}: give {{"keys": [{{"time": 0, "eye": [x, y, z], "target": [x, y, z]}}, ...]}}')
+        raise UserError(
+            f'{path}: it has no keys; give {{"keys": [{{"time": 0, "eye": [x, y, z], "target": [x, y, z]}}, ...]}}'
+        )
     rows = np.array([_key(path, number, entry) for number, entry in enumerate(entries)])
-    if (np.diff(rows[:, 0]) <= 0.0).any():
-        raise UserError(f"{path}: the times of its keys do not increase; sort the keys")
+    for number in range(1, len(rows)):
+        before, time = rows[number - 1 : number + 1, 0]
+        if time <= before:
+            raise UserError(
+                f"{path}: the time {time:g} s of key {number} is not later than {before:g} s of the key before it; sort"
+                " the keys, and give each its own time"
+            )
     return rows
 
 
@@ -286,7 +294,10 @@ def _key(path: Path, number: int, entry: Any) -> list[float]:
     except (TypeError, KeyError, ValueError, AttributeError):
         row = []
     if len(row) != 8 or not np.isfinite(row).all() or max(map(abs, row)) > 1e12:
-        raise UserError(f"{path}: key {number} needs a finite time, eye [x, y, z] and target [x, y, z]; correct it")
+        raise UserError(
+            f"{path}: key {number} is {json_excerpt(entry)}; give a time, an eye [x, y, z], a target"
+            " [x, y, z] and, optionally, a fov, each finite and at most 1e12"
+        )
     if not 1.0 <= row[7] <= 150.0:
         raise UserError(f"{path}: fov of key {number} is {row[7]:g}; give degrees from 1 to 150")
     return row

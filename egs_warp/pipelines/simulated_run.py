@@ -412,8 +412,13 @@ def checked_activations(creature: Creature, activations: np.ndarray, step: float
         advice = f"give a row of {count} metres, one for each muscle, for each of at least {min_steps} solver steps"
         raise ArgumentError("activations", f"of shape {values.shape}; {advice}")
     # The condition is not "any above the bound", because NaN must be rejected, too.
-    if not (np.abs(values) <= creature.muscles.bounds * (1.0 + 1e-9)).all():
+    bounds = creature.muscles.bounds
+    is_allowed = np.abs(values) <= bounds * (1.0 + 1e-9)
+    if not is_allowed.all():
+        row, muscle = np.unravel_index(np.argmin(is_allowed), values.shape)
         raise ArgumentError(
-            "activations", "some are outside the bounds of their muscle; keep each within muscles.bounds"
+            "activations",
+            f"{values[row, muscle]:g} m in row {row} is outside the bound {bounds[muscle]:g} m of muscle {muscle}; keep"
+            " each within muscles.bounds",
         )
     return values

@@ -69,8 +69,8 @@ def skin_of(run: FinishedRun, frames: np.ndarray, *, mesh: Path | None = None) -
     local = (nodes - origins[:, None]) @ matrices
     upright = Rotation.from_matrix(Y_UP.axes)
     rotations = (upright * turns * upright.inv()).as_quat()
-    # Make the signs of consecutive quaternions equal: some programs would interpolate quaternions of opposite sign
-    # through zero.
+    # Choose the sign of each quaternion so that its dot product with the previous one is not negative; otherwise, some
+    # programs would interpolate through zero.
     signs = np.cumprod(np.sign(np.einsum("ki,ki->k", rotations[1:], rotations[:-1])))
     rotations[1:] *= np.where(signs == 0.0, 1.0, signs)[:, None]
     return SkinnedMesh(
@@ -105,10 +105,20 @@ def read_triangles(path: Path, frame: BodyFrame) -> tuple[np.ndarray, np.ndarray
     except (Exception, SystemExit) as error:
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise UserError(f"{path}: cannot be read as a mesh of triangles ({reason[0][:200]}); write it again") from error
-    if points.shape[1] != 3 or not (np.abs(points) <= MAX_COORDINATE).all():
-        raise UserError(f"{path}: a vertex does not have three finite coordinates; write it again")
-    if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(points):
-        raise UserError(f"{path}: has no triangles, or a triangle that refers to a missing vertex; write it again")
+    is_valid = (np.abs(points) <= MAX_COORDINATE).all(axis=1) & (points.shape[1] == 3)
+    if not is_valid.all():
+        number = int(np.argmin(is_valid))
+        raise UserError(
+            f"{path}: vertex {number} is at {points[number].tolist()}; give three finite coordinates, at most"
+            f" {MAX_COORDINATE:g}"
+        )
+    if len(faces) == 0:
+        raise UserError(f"{path}: it has no triangles; give a mesh that has some")
+    if faces.min() < 0 or faces.max() >= len(points):
+        raise UserError(
+            f"{path}: a triangle refers to a missing vertex (indices {faces.min()} to {faces.max()}, {len(points)}"
+            " vertices); write it again"
+        )
     return frame.points(points), faces
 
 

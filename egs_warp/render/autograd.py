@@ -80,7 +80,8 @@ def render_torch(
     attributes = (means, rotations, log_scales, opacity_logits, sh)
     _check_tensors(*attributes)
     if (rotation is None) != (translation is None):
-        raise UserError("render: give the pose's rotation and translation together, or neither")
+        given = "translation" if rotation is None else "rotation"
+        raise UserError(f"render: only the pose's {given} is given; give rotation and translation together, or neither")
     # Threads are not used on a GPU, and counting them requires a system call.
     threads = 1 if means.is_cuda else threads or available_threads()
     task = _Task(camera, background, antialiased, mask, threads)

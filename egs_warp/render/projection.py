@@ -65,8 +65,15 @@ def _view(width: int, height: int, lens: tuple[float, ...], rotation: bytes, tra
     """Build the view. The result is cached, because filling the struct takes longer than a kernel launch."""
     fx, fy, cx, cy, near, far = lens
     turn, shift = np.frombuffer(rotation), np.frombuffer(translation)
-    if not all(map(math.isfinite, (fx, fy, cx, cy, near, *turn, *shift))) or fx <= 0 or fy <= 0:
-        raise UserError("camera: its pose and intrinsics must be finite and its focal lengths positive")
+    if not all(map(math.isfinite, (fx, fy, cx, cy, near))) or fx <= 0 or fy <= 0:
+        raise UserError(
+            f"camera: fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}, near {near:g}: give finite intrinsics and positive"
+            " focal lengths"
+        )
+    if not all(map(math.isfinite, (*turn, *shift))):
+        raise UserError(
+            f"camera: rotation {turn.tolist()} and translation {shift.tolist()}: give a pose of finite numbers"
+        )
     if width < 1 or height < 1:
         raise UserError(f"camera: image size {width} x {height} must be at least 1 x 1")
     if not 0 < near < far:

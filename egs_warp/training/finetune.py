@@ -349,11 +349,14 @@ def _check(
             ("alpha", view.alpha, shape),
             ("weight", view.weight, shape),
         ):
-            if values is not None and (values.shape != expected or not np.isfinite(values).all()):
+            if values is None:
+                continue
+            if values.shape != expected:
                 raise UserError(
-                    f"finetune: {name} of view {number} has shape {values.shape}, expected {expected} and finite"
-                    " values; correct it"
+                    f"finetune: {name} of view {number} has shape {values.shape}, expected {expected}; resize it"
                 )
+            if wrong := int(np.count_nonzero(~np.isfinite(values))):
+                raise UserError(f"finetune: {name} of view {number} has {wrong} values that are not finite; correct it")
     if trainable is not None and np.shape(trainable) != (cloud.count,):
         raise UserError(f"finetune: trainable has shape {np.shape(trainable)}, expected ({cloud.count},)")
     if trainable is not None and options.densification is not Densification.NONE:

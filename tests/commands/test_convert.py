@@ -315,7 +315,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         (["no", "out", "--to", "ply"], "no: no such file or folder"),
         ([".", "out", "--to", "ply"], "it has no numbered captures such as frame0001.ply"),
         (["two", "out", "--to", "ply"], "it has two sequences (a0001.ply and b0001.ply)"),
-        (["same", "out", "--to", "ply"], "two of its captures have the same number"),
+        (["same", "out", "--to", "ply"], "a01.ply and a1.ply have the same number"),
         (["two", "two", "--to", "ply"], "it has two sequences"),
         (["a.ply", "b.ply", "--scale", "0"], "--scale 0.0: give a positive number"),
         (["a.ply", "b.ply", "--count", "0"], "--count 0: give a number of at least 1"),

@@ -83,10 +83,20 @@ def test_a_prop_on_a_platform_that_stands_still_sleeps_until_it_moves() -> None:
 
 
 @pytest.mark.parametrize(
-    ("times", "shifts", "repeat"),
-    [([], [], False), ([1.0, 0.5], [(0.0,) * 3] * 2, False), ([0.0], [(0.0,) * 3], False), ([1.0], [(1.0, 0.0)], False)]
-    + [([1.0], [(np.nan, 0.0, 0.0)], False), ([1.0], [(1.0, 0.0, 0.0)], True)],
+    ("times", "shifts", "repeat", "message"),
+    [
+        ([], [], False, "it has no points"),
+        ([1.0, 0.5], [(0.0,) * 3] * 2, False, "time 2 is 0.5 s, and the one before it 1 s"),
+        ([0.0], [(0.0,) * 3], False, "time 1 is 0 s, and the one before it 0 s"),
+        ([np.inf], [(0.0,) * 3], False, "time 1 is inf s"),
+        ([1.0], [(0.0,) * 3] * 2, False, "the numbers of times, shifts and turns are 1, 2 and 1; give one"),
+        ([1.0], [(1.0, 0.0)], False, r"shift 1 has shape \(2,\); give three numbers"),
+        ([1.0], [(np.nan, 0.0, 0.0)], False, r"shift 1 is \[nan, 0.0, 0.0\]; give finite numbers"),
+        ([1.0], [(1.0, 0.0, 0.0)], True, r"it ends with the shift \[1.0, 0.0, 0.0\] and the turn 0, but"),
+    ],
 )
-def test_invalid_paths_are_refused(times: list[float], shifts: list[tuple[float, ...]], repeat: bool) -> None:
-    with pytest.raises(UserError, match=r"^path: "):
+def test_invalid_paths_are_refused(
+    times: list[float], shifts: list[tuple[float, ...]], repeat: bool, message: str
+) -> None:
+    with pytest.raises(UserError, match=rf"^path: {message}"):
         RigidPath(times, shifts, repeat=repeat)

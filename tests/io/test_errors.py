@@ -112,7 +112,7 @@ def test_values_that_are_not_finite_are_named(name: str, value: float, tmp_path:
         ),
         (
             (b"property float f_rest_8\n", b"property float x\n"),
-            "malformed .ply header, element vertex repeats a property",
+            "malformed .ply header, element vertex repeats property x",
         ),
         ((b"property float x\n", b"property colour x\n"), "malformed .ply header, line 'property colour x'"),
         ((b"element vertex 7\n", b"element vertex many\n"), "malformed .ply header, line 'element vertex many'"),
@@ -209,7 +209,8 @@ def test_bad_splat(tmp_path: Path) -> None:
     for row in range(3, 7):
         struct.pack_into("<f", data, row * 32 + 12, -1.0)
     assert message(written(path, bytes(data))) == (
-        "scale of 4 Gaussians is negative (first: number 3); if the file is a .splat, export it again"
+        "4 Gaussians have a negative scale (the first is number 3), so the file is damaged or not a .splat; export it"
+        " again"
     )
 
 

@@ -129,7 +129,7 @@ def _changed(tree: dict[str, Any], case: str) -> None:
         ("long", "accessor 0 extends beyond its buffer"),
         ("negative", "accessor 0 extends beyond its buffer"),
         ("no scales", "malformed glTF (KeyError"),
-        ("flat", "the transform of a node is singular"),
+        ("flat", "the transform of node 0 is singular"),
         ("nonsense", "malformed glTF (TypeError"),
     ],
 )

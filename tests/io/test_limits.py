@@ -128,7 +128,11 @@ def test_leaves_that_overlap(leaves: int, said: str | None, tmp_path: Path) -> N
 def test_odd_trees(tmp_path: Path) -> None:
     files = {f"part/{name}": data for name, data in members().items()}
     for names, level, said in (
-        (["part/meta.json", "./part/meta.json"], "0", "lod-meta.json names a file twice; export the capture again"),
+        (
+            ["part/meta.json", "./part/meta.json"],
+            "0",
+            "lod-meta.json names './part/meta.json' twice; export the capture again",
+        ),
         (["part/meta.json"], "9" * 5000, "it has no Gaussians; export it again from the tool that made it"),
     ):
         tree = {"lods": {level: {"file": 0, "offset": 0, "count": 7}}}
@@ -270,5 +274,5 @@ def test_memory_to_read_a_valid_capture_is_bounded(tmp_path: Path, ending: str) 
 def test_two_elements_of_one_name(tmp_path: Path) -> None:
     data = good_bytes("a.ply").replace(b"element vertex 7\n", b"element vertex 1\nproperty float x\nelement vertex 7\n")
     assert message(written(tmp_path / "a.ply", data)) == (
-        "malformed .ply header, an element occurs twice; export the file again"
+        "malformed .ply header, element vertex occurs twice; export the file again"
     )

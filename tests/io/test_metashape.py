@@ -141,7 +141,7 @@ def test_metashape_leaves_out_what_is_not_aligned(tmp_path: Path) -> None:
             document(kind="spherical"),
             "camera 00 has a sensor of type 'spherical'; give one of frame, fisheye, equidist",
         ),
-        (document(calibration="<f>wide</f>"), "camera 00 has a sensor with invalid numbers"),
+        (document(calibration="<f>wide</f>"), "camera 00 has a sensor with invalid numbers (f not finite)"),
         (document().replace(f'width="{WIDTH}"', ""), "camera 00 has a sensor without resolution"),
         (document().replace("<scale>2.5", "<scale>-2.5"), "camera 00: its transform is not a rotation with a positive"),
     ],

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.io.text import MAX_NESTING, load_json, parse_json
+from egs_warp.io.text import MAX_NESTING, json_excerpt, load_json, parse_json
 from egs_warp.io.yaml_file import read_yaml
 
 
@@ -41,3 +41,8 @@ def test_nesting_of_yaml_is_limited(depth: int, tmp_path: Path) -> None:
     else:
         with pytest.raises(UserError, match="nested too deeply; write fewer levels"):
             read_yaml(path)
+
+
+def test_an_excerpt_of_a_long_value_is_short() -> None:
+    assert json_excerpt({"a": [1, "b"]}) == '{"a": [1, "b"]}'
+    assert json_excerpt(list(range(1000))) == f"{json.dumps(list(range(1000)))[:60]} ..."

@@ -81,9 +81,9 @@ def test_a_weight_applies_until_its_key(tmp_path: Path) -> None:
     ("content", "message"),
     [
         ("{", "not JSON"),
-        ({"time": 1}, "give a list of keys, each an object with time, part, quantity, value"),
+        ({"time": 1}, 'it contains {"time": 1}; give a list of keys, each an object with time, part, quantity, value'),
         ([], "no key frames; give at least one"),
-        ([3], "key 1: 3 is not an object with time, part, quantity, value"),
+        ([3], "key 1 is 3; give an object with time, part, quantity, value"),
         ([{k: v for k, v in GOOD.items() if k != "part"}], 'key 1: "part" is missing'),
         (
             [GOOD, {**GOOD, "time": 1, "speed": 3}],
@@ -107,7 +107,7 @@ def test_a_weight_applies_until_its_key(tmp_path: Path) -> None:
         ([{**GOOD, "time": 10**401}], "key 1: time inf: give seconds above 0, at most 60"),
         (
             [{**GOOD, "time": 1e-320}],
-            "key 1: time 9.99989e-321 is less than 0.001 s after the start of head position at 0 s",
+            "key 1 (head position): time 9.99989e-321 s is less than 0.001 s after the start at 0 s",
         ),
         ([{**GOOD, "value": [0, 10**401, 0]}], "key 1: value [0, inf, 0]: give three numbers"),
         (f'[{{"time": {5000 * "9"}}}]', 'key 1: "part" is missing'),
@@ -118,7 +118,10 @@ def test_a_weight_applies_until_its_key(tmp_path: Path) -> None:
             "key 1: value [0, 0, -361] has the length 361; at most 360 is allowed",
         ),
         ([{**GOOD, "weight": 0}], "key 1: weight 0: give a number above 0, at most 1000"),
-        ([GOOD, GOOD], "key 2: time 0.5 is less than 0.001 s after the previous key of head position at 0.5 s"),
+        (
+            [GOOD, GOOD],
+            "key 2 (head position): time 0.5 s is less than 0.001 s after the previous key at 0.5 s; sort the keys",
+        ),
     ],
 )
 def test_malformed_json(tmp_path: Path, content: object, message: str) -> None:

@@ -174,12 +174,12 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
     [
         ("[", "not JSON at line 1"),
         ("[" * 100_000, "its lists are nested too deeply; write fewer levels"),
-        ("{}", 'give a list of motions, such as [{"motion": "jump"}]'),
-        ("[3]", f', motion 1: give an object with a "motion", one of {KNOWN}'),
+        ("{}", 'it contains {}; give a list of motions, such as [{"motion": "jump"}]'),
+        ("[3]", f', motion 1 is 3; give an object with a "motion", one of {KNOWN}'),
         ('[{"motion": "walk", "with": 3}]', ', motion 1: "with" is 3; give a list of gestures'),
         (
             '[{"motion": "walk", "with": ["nod"]}]',
-            ', motion 1: give a "motion" for each gesture of "with", one of nod,',
+            ', motion 1: "with" contains "nod"; give a "motion" for each gesture, one of nod,',
         ),
         ('[{"motion": "walk", "with": [{"motion": "hop"}]}]', ", motion 1: hop is not a gesture; gestures are: nod,"),
         ('[{"motion": "jump", "repeat": 1.5}]', ', motion 1: "repeat" is 1.5; give a whole number'),

@@ -82,7 +82,7 @@ def test_stiffness_strain_units_groups_and_partners(tmp_path: Path) -> None:
             "\"fibers\" is not known here (did you mean 'fibres'?); use fibres, max_strain, mirror_plane",
         ),
         ({"fibres": [STRAIGHT], "max_strain": 1.5}, '"max_strain" is 1.5; give a number below 1'),
-        ({"fibres": [STRAIGHT], "mirror_plane": 1}, '"mirror_plane" must be an object'),
+        ({"fibres": [STRAIGHT], "mirror_plane": 1}, '"mirror_plane" is 1; give an object with "point" and "normal"'),
         (
             {"fibres": [STRAIGHT], "mirror_plane": {"point": [0, 0, 0], "normal": [0, 0, 0]}},
             'mirror_plane: "normal" is zero; give a direction',
@@ -105,9 +105,12 @@ def test_stiffness_strain_units_groups_and_partners(tmp_path: Path) -> None:
         ({"fibres": [{**STRAIGHT, "mirror": True}]}, "is mirrored but the file has no plane"),
         ({"fibres": [STRAIGHT, STRAIGHT]}, 'fibre "back" occurs twice'),
         ({"fibres": [{**STRAIGHT, "to": [0, 0, 9]}]}, "the point [0, 0, 9] is 8 units away from the body"),
-        ({"fibres": [{**STRAIGHT, "to": STRAIGHT["from"]}]}, "has two equal points in a row"),
+        ({"fibres": [{**STRAIGHT, "to": STRAIGHT["from"]}]}, "has two equal points in a row, ["),
         ({"fibres": [{**STRAIGHT, "segments": 400}, {**STRAIGHT, "name": "b"}]}, "404 segments in all"),
-        ({"fibres": [{**FREE, "points": [[0, 0, 0.5]]}]}, "at least two points"),
+        (
+            {"fibres": [{**FREE, "points": [[0, 0, 0.5]]}]},
+            '"points" is [[0, 0, 0.5]]; give a list of at least two points',
+        ),
         ({"fibres": [{**FREE, "points": [[0, 0, 0.5], "x"]}]}, 'point 2 is "x"; give three finite numbers'),
         ({"fibres": [{**HOOP, "segments": 2}]}, '"segments" is 2; give a whole number from 3'),
         ({"fibres": [{**HOOP, "radius": 0}]}, '"radius" is 0; give a number above 0'),

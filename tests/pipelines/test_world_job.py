@@ -50,7 +50,7 @@ def test_a_world_of_props_that_stopped_is_not_done() -> None:
 
 def test_jobs_of_a_creature_are_no_jobs_of_a_world() -> None:
     jobs: Any = [Job(motion("jump"))]
-    with pytest.raises(UserError, match=r"jobs: give only egs\.WorldJob, the jobs of a world"):
+    with pytest.raises(UserError, match=r"jobs: job 0 is a Job; give only egs\.WorldJob, the jobs of a world"):
         simulate_many(World(), jobs)
     with pytest.raises(UserError, match="worlds 4: batches are for one creature"):
         simulate_many(World(), [WorldJob()], worlds=4)  # pyright: ignore[reportCallIssue, reportArgumentType]

@@ -240,7 +240,7 @@ def test_pixels_share_memory_and_bad_tensors_are_named() -> None:
         UserError, match=r"rotations is \(7, 3\) torch.float32 on cpu, expected \(7, 4\) float32 on cpu"
     ):
         render_torch(tensors[0], tensors[1][:, :3], *tensors[2:], camera=camera)
-    with pytest.raises(UserError, match="rotation and translation together"):
+    with pytest.raises(UserError, match="only the pose's rotation is given; give rotation and translation together"):
         render_torch(*tensors, camera=camera, rotation=torch.eye(3))
 
 

@@ -308,7 +308,7 @@ def test_impossible_cameras_and_backgrounds_are_refused() -> None:
         render_gaussians(cloud, Camera(**{**camera_of().__dict__, "width": 0}))
     with pytest.raises(UserError, match=r"near 2.0 and far 1.0 must satisfy"):
         render_gaussians(cloud, camera_of(near=2.0, far=1.0))
-    with pytest.raises(UserError, match="pose and intrinsics must be finite"):
+    with pytest.raises(UserError, match=r"fx nan, fy .*: give finite intrinsics and positive focal lengths"):
         render_gaussians(cloud, Camera(**{**camera_of().__dict__, "fx": float("nan")}))
     with pytest.raises(UserError, match=r"an image of 45 x 67 x 3, not shape \(3, 3\)"):
         render_gaussians(cloud, camera_of(), background=np.ones((3, 3)))
@@ -330,7 +330,7 @@ def test_sorted_lists_equal_counted_ones(spread: float, monkeypatch: pytest.Monk
     tiles = 13 * 10
     counted = [_lists_by_counting(projected, view, tiles, threads) for threads in (1, 2, 3)]
     pairs = projected.slot_count
-    # The capacity is not guessed, guessed large enough, or guessed too small.
+    # Three cases: no guess of the capacity, a guess that is large enough, and a guess that is too small.
     monkeypatch.setattr("egs_warp.render.tiles._expected", {"cpu": pairs})
     guessed = _lists_by_sorting(projected, view, tiles, guess=True)
     assert lists_fit(guessed, projected) and len(guessed.gaussian_from_intersection) > pairs

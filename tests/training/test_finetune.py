@@ -175,8 +175,10 @@ def test_bad_views_are_named() -> None:
     image = np.zeros((40, 40, 3), dtype=np.float32)
     with pytest.raises(UserError, match="finetune: there are no views"):
         finetune(cloud, [])
-    with pytest.raises(UserError, match=r"image of view 1 has shape \(8, 8, 3\), expected \(40, 40, 3\) and finite"):
+    with pytest.raises(UserError, match=r"image of view 1 has shape \(8, 8, 3\), expected \(40, 40, 3\); resize"):
         finetune(cloud, [TrainingView(camera, image), TrainingView(camera, image[:8, :8])])
+    with pytest.raises(UserError, match="image of view 0 has 4800 values that are not finite; correct it"):
+        finetune(cloud, [TrainingView(camera, np.full_like(image, np.nan))])
     with pytest.raises(UserError, match=r"trainable has shape \(3,\), expected \(10,\)"):
         finetune(cloud, [TrainingView(camera, image)], trainable=np.ones(3, bool))
     with pytest.raises(UserError, match="give either trainable or a densification"):
