@@ -76,9 +76,12 @@ def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]
 def support_report(stepper: LocomotionStepper, report: StepReport) -> StepReport:
     """Return the ``report`` of a body among others with only the contacts that support the body: those with the ground,
     and those with other bodies below it. A motion must not treat another body that pushes from the side as its ground.
+
+    The minimum gap is that to the ground or, if it is smaller, that of a contact with a body below.
     """
     contacts, up = report.contacts, -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
     kept = (contacts.faces >= 0) | (contacts.axes[:, 0] @ up > _MIN_SUPPORT_COSINE)
+    below = report.end_gaps[kept & (contacts.faces < 0)]
     contacts = replace(contacts, **{name: value[kept] for name, value in contacts.batched_fields()})
     gaps, _ = stepper.detector.gaps(report.state.positions)
     return replace(
@@ -86,7 +89,7 @@ def support_report(stepper: LocomotionStepper, report: StepReport) -> StepReport
         contacts=contacts,
         forces=report.forces[kept],
         end_gaps=report.end_gaps[kept],
-        min_gap=float(gaps.min()),
+        min_gap=min(float(gaps.min()), float(below.min(initial=np.inf))),
     )
 
 

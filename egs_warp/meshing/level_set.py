@@ -161,7 +161,10 @@ def level_set_of_body(solid: LatticeSolid, points: np.ndarray) -> LevelSet:
     sharp -= 0.5 * np.sign(sharp)
     shape = np.minimum(np.asarray(ndimage.gaussian_filter(sharp, _SURFACE_BLUR)), sharp + _THIN_SLACK)
     outer = points[outer_points(points, EXPOSURE_RADIUS * spacing)]
-    shape = _moved_to_points(shape, (outer - origin) / spacing)
+    places = (outer - origin) / spacing
+    # Points of fragments that the solid does not contain may lie outside the lattice.
+    in_lattice = ((places >= 0.0) & (places < np.array(shape.shape) - 1.0)).all(axis=1)
+    shape = _moved_to_points(shape, places[in_lattice])
     vertices, faces, _, _ = measure.marching_cubes(shape, 0.0)
     vertices = origin + spacing * vertices.astype(np.float64)
     counts = np.array(inside.shape)

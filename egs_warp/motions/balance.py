@@ -70,7 +70,7 @@ class Measurement(BatchedRecord):
     foot_centre: np.ndarray
     """(..., 2) m, centre of the feet: the nodes that are near the ground at rest."""
     sole_height: np.ndarray
-    """(...,) m, height of the lowest contact point above the ground."""
+    """(...,) m, height of the lowest contact point above the ground, or above a body that supports it."""
     in_contact: np.ndarray
     """(...,) bool, True if a contact force acts."""
     normal_load: np.ndarray

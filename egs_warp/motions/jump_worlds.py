@@ -183,7 +183,7 @@ class JumpWorlds(MotionWorlds):
             [
                 self.skips_settling | (elapsed >= SETTLE_TIME * self.time_unit),
                 elapsed >= plan.crouch_time,
-                self._is_thrust_done(measurement, in_contact, dt),
+                self._is_thrust_done(measurement, dt),
                 self.flew & self._has_landed(measurement, in_contact),
                 elapsed >= MAX_LANDING_TIME * self.time_unit,
             ],
@@ -216,7 +216,7 @@ class JumpWorlds(MotionWorlds):
         self.current.scatter(rows, self.landing.gather(rows))
         self.is_airborne[rows] = True
 
-    def _is_thrust_done(self, measurement: Measurement, in_contact: np.ndarray, dt: float) -> np.ndarray:
+    def _is_thrust_done(self, measurement: Measurement, dt: float) -> np.ndarray:
         """Return the mask (c,) bool of bodies whose thrust is over: in free flight, the centre of mass would reach
         ``STOP_RISE_FRACTION`` of the requested height, or the body has left the ground."""
         gravity = self.current.gravity
@@ -224,7 +224,7 @@ class JumpWorlds(MotionWorlds):
         apex = measurement.com[:, 2] + speed**2 / (2.0 * gravity)
         enough = apex >= self.start_com[:, 2] + STOP_RISE_FRACTION * self.height
         # The thrust of a body in the air is over at any speed, because the feet must be steered from then on.
-        return enough | ~(in_contact | (measurement.sole_height <= 0.0))
+        return enough | ~(measurement.in_contact | (measurement.sole_height <= 0.0))
 
     def _has_landed(self, measurement: Measurement, in_contact: np.ndarray) -> np.ndarray:
         """Return the mask (c,) bool of bodies that have landed. While a body is still high, only contacts that carry

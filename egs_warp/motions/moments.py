@@ -75,7 +75,7 @@ class ReducedState(BatchedRecord):
     load: Any
     """(...,) N, sum of the normal contact forces."""
     gap: Any
-    """(...,) m, height of the lowest contact point above the ground."""
+    """(...,) m, height of the lowest contact point above the ground, or above a body that supports it."""
 
     def with_capacity(self, capacity: int) -> ReducedState:
         """Return the reduced state of one world on the host, with its contact points padded with zeros to

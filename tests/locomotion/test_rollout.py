@@ -170,3 +170,11 @@ def test_bodies_that_push_from_the_side_are_no_support() -> None:
     np.testing.assert_array_equal(report.contacts.weights, contacts.weights[1:])
     np.testing.assert_array_equal(report.forces, reports[-1].forces[1:])
     assert report.min_gap == reports[-1].min_gap
+    # Lifted by 0.3 m, the body touches only the body below: its minimum gap is that of contact 1.
+    lifted = replace(pushed.state, positions=pushed.state.positions + np.array([0.0, 0.0, 0.3]))
+    gaps = np.full(contacts.count, 0.3)
+    gaps[:2] = -0.2, -1e-4
+    run.finish_step([replace(pushed, state=lifted, end_gaps=gaps)])
+    run.objectives(1.0 / 60.0)
+    report = seen[-1]
+    assert report is not None and report.min_gap == -1e-4

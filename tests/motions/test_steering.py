@@ -60,15 +60,16 @@ def test_a_command_turns_on_the_spot_only_for_large_angles() -> None:
     assert steering_command(3.0, np.array([np.cos(-3.0), np.sin(-3.0)])).turn > 0.0
 
 
-def test_eight_walkers_cross_a_circle_without_touching() -> None:
-    """The walkers are discs that turn and move exactly as commanded. All of them reach the opposite side of the
-    circle."""
+@pytest.mark.parametrize(("pace", "seconds"), [(1.0, 30.0), (0.4, 54.0)])
+def test_eight_walkers_cross_a_circle_without_touching(pace: float, seconds: float) -> None:
+    """The walkers are discs that turn as commanded and walk at a fraction ``pace`` of the commanded speed. All reach
+    the opposite side of the circle within the time limit of such a walk (``test_towards``)."""
     count, radius, touching, dt = 8, 1.5, 0.45, 0.1
     angles = 2.0 * np.pi * np.arange(count) / count
     at = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     goals, headings, before = -at, angles + np.pi, at.copy()
     speed_unit = 9.81**0.5
-    for _ in range(300):
+    for _ in range(round(seconds / dt)):
         velocities, before = (at - before) / dt, at.copy()
         for each in range(count):
             if np.linalg.norm(goals[each] - at[each]) < 0.05:
@@ -87,7 +88,7 @@ def test_eight_walkers_cross_a_circle_without_touching() -> None:
             command = steering_command(headings[each], heading)
             headings[each] += dt * speed_unit * command.turn
             along = np.array([np.cos(headings[each]), np.sin(headings[each])])
-            at[each] += dt * speed_unit * command.forward * along
+            at[each] += dt * pace * speed_unit * command.forward * along
         apart = np.linalg.norm(at[:, None] - at[None], axis=-1) + 10.0 * np.eye(count)
         assert apart.min() > touching
     assert np.linalg.norm(goals - at, axis=1).max() < 0.05

@@ -66,6 +66,9 @@ def test_a_walk_to_a_prop_is_refused_with_one_line() -> None:
     # The target of a later motion is checked at the position at which that motion starts.
     expected = script_among("walk to king, kick king, walk to 1.5,0", {"king": king}, stance).check(stance)
     assert expected[0] > 0.0 and expected[1:] == [0.0, 0.0]
+    # Slow discs are given 54 s to cross a circle of 3 m together (``test_steering``).
+    (crossing,) = script_among("walk to 3,0", {f"king-{k}": king for k in range(7)}, stance).requests
+    assert crossing.seconds is not None and crossing.seconds > 54.0
 
 
 @pytest.mark.parametrize(

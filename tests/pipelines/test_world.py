@@ -18,6 +18,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.rigid_path import RigidPath
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.ledger import energy_balance
+from egs_warp.locomotion.world_audit import ContactShape, audit_world
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.landing import landing_of
 from egs_warp.pipelines.creature import Creature, initial_stance
@@ -164,6 +165,44 @@ def test_what_goes_over_the_edge_of_the_ground_falls() -> None:
     assert np.isfinite(t.positions).all()
 
 
+def world_with_block(creature: Creature, axes: np.ndarray, *, density: float = 1000.0) -> World:
+    """Return a world with these ``axes`` (3, 3) and a block of height 0.4, on which ``creature`` stands in the
+    capture."""
+    own = creature.frame
+    cloud = blocks(((-0.6, -0.6, -0.4), (0.6, 0.6, -0.02)))
+    frame = BodyFrame(axes, own.origin - 0.4 * UP, own.scale)
+    world = World(surroundings=Surroundings(frame, creature.cloud))
+    block = make_prop(cloud, plane=Plane(UP, 0.4), metres_per_unit=own.scale, density=density)
+    world.add(block, name="block", as_captured=True)
+    return world
+
+
+@pytest.mark.slow
+def test_a_creature_jumps_from_a_heavy_block_as_from_the_ground() -> None:
+    """A motion regards the block as its ground: the thrust lasts as long and the jump is as high. The forces between
+    the two bodies cancel, and the block stays where it is."""
+    creature = coarse_pawn()
+    on_ground = World()
+    on_ground.add(creature, name="pawn")
+    on_block = world_with_block(creature, creature.frame.axes, density=4000.0)
+    on_block.add(creature, name="pawn", as_captured=True)
+    rises = []
+    for world in (on_ground, on_block):
+        run = simulate_world(world, {"pawn": "jump 0.2 0.3"}, frames=60)
+        heights = run["pawn"].trajectory.positions @ UP @ creature.body.node_mass / creature.body.mass
+        rises.append(heights.max() - heights[0])
+    assert rises[0] == pytest.approx(0.3 * creature.body.height, rel=0.1)
+    assert rises[1] == pytest.approx(rises[0], rel=0.05)
+    bodies = [member.body for member in on_block.members]
+    shapes = [ContactShape.of(body.geometry, body.shape.level_set, body.mesh.nodes) for body in bodies]
+    result = audit_world([run[member].trajectory for member in on_block.members], shapes)
+    assert result.momentum_residual < 1e-12 and result.angular_momentum_residual < 1e-12
+    (pair,) = result.pairs
+    assert pair.unmatched_contacts == 0 and max(pair.force_residual, pair.torque_residual) < 1e-12
+    block = run["block"].trajectory.positions
+    assert np.abs(block - block[0]).max() < 0.005
+
+
 @pytest.mark.slow
 def test_a_body_is_placed_as_captured_and_stands_on_another_one() -> None:
     """The pawn of a capture stands on a block below it. In a world that is turned by 90 degrees, both are where the
@@ -171,15 +210,9 @@ def test_a_body_is_placed_as_captured_and_stands_on_another_one() -> None:
     creature = coarse_pawn()
     own = creature.frame
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    axes = turn @ own.axes
-    block = make_prop(
-        blocks(((-0.6, -0.6, -0.4), (0.6, 0.6, -0.02))),
-        plane=Plane(UP, 0.4),
-        metres_per_unit=own.scale,
-    )
-    frame = BodyFrame(axes, own.origin - 0.4 * UP, own.scale)
-    world = World(surroundings=Surroundings(frame, creature.cloud))
-    world.add(block, name="block", as_captured=True)
+    world = world_with_block(creature, turn @ own.axes)
+    assert world.surroundings is not None
+    frame = world.surroundings.frame
     placed = world.add(creature, name="pawn", as_captured=True).body
     assert isinstance(placed, Creature) and placed.stands_on_body and not world.member("block").body.stands_on_body
     captured = own.capture_points(creature.start.positions)
