@@ -13,7 +13,7 @@ from egs_warp.errors import UserError
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 
 _EXACT_DIGITS = 15
-"""Maximum number of digits of integers that are always exact as floats."""
+"""Maximum number of digits at which every integer is exact as a float."""
 MAX_NESTING = 100
 """Maximum depth of nested lists and objects in a file."""
 _STRING_OR_BRACKET = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"?|[\[\]{}]', re.DOTALL)
@@ -46,8 +46,8 @@ def decimal_number(word: str) -> float:
 
 
 def whole_number(digits: str) -> int | float:
-    """Parse an integer. More than ``_EXACT_DIGITS`` digits give a float, possibly infinite, outside every valid
-    range."""
+    """Parse an integer. An integer with more than ``_EXACT_DIGITS`` digits becomes a float, possibly infinite, which is
+    outside every valid range."""
     return int(digits) if len(digits) <= _EXACT_DIGITS else float(digits)
 
 

@@ -69,19 +69,19 @@ class Reader:
     other_files: Callable[[], dict[str, bytes]] = dict
     """Other files of the folder, by name."""
     wrap: Callable[[bytes], bytes] = bytes
-    """Conversion of an input to the file's bytes, for corruption inside a checksum."""
+    """Function that converts an input to the bytes of the file, for corruption that does not invalidate a checksum."""
     json: bool = False
-    """True if inputs are JSON trees."""
+    """True if the inputs are JSON trees."""
 
 
 class BrokenPromiseError(AssertionError):
-    """A reader returned neither a valid object nor a one-line error, or was too slow."""
+    """Raised if a reader returns neither a valid object nor a one-line error, or is too slow."""
 
 
 def outcome(reader: Reader, folder: Path, data: bytes) -> str:
     """Read a file; return ``valid`` or ``refused``, or raise ``BrokenPromiseError``.
 
-    A slow read is repeated, and only the second time counts, because the machine may have paused during the first.
+    A slow read is repeated and only its second time counts, because the machine may have paused during the first one.
     """
     path = folder / reader.file
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -247,7 +247,7 @@ def _photo(path: Path) -> None:
 
 @cache
 def _record() -> dict[str, bytes]:
-    """Return the files of a recorder after eight steps, by name."""
+    """Return the files, by name, that a recorder writes for eight steps."""
     slid = slide()
     with tempfile.TemporaryDirectory() as folder:
         recorder = slid.recorder(folder=lambda: Path(folder))
@@ -287,7 +287,7 @@ _MESSAGES = [
 
 
 def _messages(path: Path) -> None:
-    """Read messages in the way of the server of ``live``; an invalid one gives a one-line error."""
+    """Read messages as the server of ``live`` does; an invalid one gives a one-line error."""
     try:
         tree = load_json(path.read_bytes())
         for message in tree if isinstance(tree, list) else [tree]:
