@@ -61,8 +61,11 @@ _TOUCHING_HEIGHT = 0.02
 _LANDED_ANGLE = 20.0
 """Maximum tilt in degrees of a base that is considered landed."""
 _CROUCH_FRACTION = 0.75
-"""Target height of the centre of mass until the body is at rest, as a fraction of its standing height. A low centre of
-mass makes the body less likely to tip over the other side of its base."""
+"""Height to which the body crouches from the free roll until it is at rest, as a fraction of its standing height. A low
+centre of mass needs less energy to pass the top, and more to tip over the other side of the base."""
+_RELAX_TIME, _MIN_EXCESS = 0.35, 0.03
+"""Time in sqrt(H / g) of the free roll in which the strain of the push relaxes before the excess is measured; and
+excess of energy at the top, divided by the weight, in body heights, below which a rolling body crouches."""
 _MIN_PUSH_DISTANCE = 0.1
 """Distance behind the edge, in body heights, beyond which contact points can push."""
 _MAX_LIE_TIME, _MAX_ROLL_TIME, _MAX_STRAIGHTEN_TIME = 6.0, 6.0, 10.0
@@ -107,8 +110,8 @@ class GetUpControl:
     spin: float = 600.0
     pose: float = 0.05
     """Weight of the standing shape while the body pushes."""
-    carried: float = 0.3
-    """Weight of the current shape while the body rolls without pushing."""
+    free: float = 0.3
+    """Weight of the rigid rotation and of the crouch while the body rolls without pushing."""
     follow: float = 8.0
     """Rate in sqrt(g / H) at which the shape is approached."""
 
@@ -167,6 +170,7 @@ class GetUp:
         self.tries = 0
         self._aim = self._margin = self._excess = self._start_degrees = 0.0
         self._rise = self._shortfall = 0.0
+        self._crouch_depth = self._free_time = 0.0
         self._axis = np.zeros(3)
         self._ground_level = 0.0
         self._stand: Stand | None = None
@@ -343,6 +347,7 @@ class GetUp:
         else:
             self._margin += max(self._aim - self._excess, 0.5 * self._aim)
         self._start_degrees = self._degrees
+        self._crouch_depth = self._free_time = 0.0
         self._rise = self._shortfall = roll.missing
         self._axis = roll.axis
         self.tries += 1
@@ -370,29 +375,59 @@ class GetUp:
 
     def _roll_objectives(self, state: BodyState, roll: _Roll, dt: float) -> list[AnyObjective]:
         """Return objectives for the centre of mass and the spin: those of a body that rolls rigidly about its edge at
-        the rate that takes it over the top. If no contact can push the body, the target is the rate of a free roll."""
-        body, control, unit = self.body, self.control, self._unit
-        weight = body.mass * self._gravity
+        the rate that takes it over the top, or, if no contact can push the body, those of a free roll."""
         elapsed = state.time - self._entered + dt
-        ahead = np.cross(roll.axis, self.ground.axes[2])
+        if not roll.pushes and elapsed - dt > 0.3 * self._unit:
+            return self._free_roll_objectives(state, roll, dt)
+        body, control = self.body, self.control
         arms = state.positions - body.centre_of_mass(state.positions)
-        carried = not roll.pushes and elapsed - dt > 0.3 * unit
-        if carried:
-            rate = roll.rate + dt * weight * float(roll.arm @ ahead) / roll.inertia
-        else:
-            rate = roll.rate + dt * self._push_acceleration(roll, elapsed)
+        rate = roll.rate + dt * self._push_acceleration(roll, elapsed)
+        turn = kabsch_rotation(body.node_mass, self._arms, arms)
+        shape = control.follow / self._unit * (self._arms @ turn.T - arms)
+        return [
+            centre_of_mass_velocity(body, rate * np.cross(roll.axis, roll.arm), control.com),
+            AngularMomentumObjective(body.inertia(state.positions) @ (rate * roll.axis), control.spin),
+            deformation_velocities(body, state.positions, shape, control.pose),
+        ]
+
+    def _free_roll_objectives(self, state: BodyState, roll: _Roll, dt: float) -> list[AnyObjective]:
+        """Return objectives of a body that no contact can push any further: it follows the free roll about its edge and
+        crouches. With a lower centre of mass, it passes the top with less energy."""
+        body, control = self.body, self.control
+        arms = state.positions - body.centre_of_mass(state.positions)
+        ahead = np.cross(roll.axis, self.ground.axes[2])
+        rate = roll.rate + dt * body.weight * float(roll.arm @ ahead) / roll.inertia
+        length = float(np.linalg.norm(roll.arm))
+        outward = roll.arm / length
+        self._free_time += dt
+        if self._free_time > _RELAX_TIME * self._unit:
+            # A body that pushes itself up is stretched, so its top is higher than that of the standing shape.
+            rise = length - float(roll.arm @ self.ground.axes[2])
+            excess = 0.5 * roll.inertia * roll.rate**2 / body.weight - rise
+            depth = min((_MIN_EXCESS * body.height - excess) / length, 1.0 - _CROUCH_FRACTION)
+            self._crouch_depth = max(self._crouch_depth, depth)
         velocity = rate * np.cross(roll.axis, roll.arm)
-        if carried:
-            pose = node_velocities(body, velocity + rate * np.cross(roll.axis, arms), control.carried)
-        else:
-            turn = kabsch_rotation(body.node_mass, self._arms, arms)
-            shape = control.follow / unit * (self._arms @ turn.T - arms)
-            pose = deformation_velocities(body, state.positions, shape, control.pose)
+        shape = np.zeros_like(arms)
+        if self._crouch_depth > 0.0:
+            follow = min(control.follow / self._unit, 0.7 / dt)
+            crouch = self._crouched_arms(arms)
+            arm = -crouch[roll.edge_nodes].mean(axis=0)
+            velocity += follow * (float(arm @ outward) - length) * outward
+            shape = follow * (crouch - arms)
+        nodes = velocity + rate * np.cross(roll.axis, arms) + shape
         return [
             centre_of_mass_velocity(body, velocity, control.com),
             AngularMomentumObjective(body.inertia(state.positions) @ (rate * roll.axis), control.spin),
-            pose,
+            node_velocities(body, nodes, control.free),
         ]
+
+    def _crouched_arms(self, arms: np.ndarray) -> np.ndarray:
+        """Return the nodes (N, 3) of the crouched body relative to its centre of mass, in the orientation of the body
+        with ``arms`` (N, 3): shortened along its up axis, and wider across it by half of the change."""
+        turn = kabsch_rotation(self.body.node_mass, self._arms, arms)
+        along = np.outer(turn @ self.ground.axes[2], turn @ self.ground.axes[2])
+        depth = self._crouch_depth
+        return self._arms @ turn.T @ (np.eye(3) - depth * along + 0.5 * depth * (np.eye(3) - along))
 
     def _push_acceleration(self, roll: _Roll, elapsed: float) -> float:
         """Return the angular acceleration in rad/s^2 of a body that pushes itself up. A constant torque over the rest

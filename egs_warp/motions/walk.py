@@ -41,7 +41,7 @@ from egs_warp.motions.walk_posture import RockingPosture, rocking_reason, select
 MIN_FOOT_LOAD = 0.01
 """Share of the weight that a foot must carry to be considered landed."""
 MAX_LAG = 0.5
-"""Mean lag of the feet, in steps, beyond which a step is repeated."""
+"""Mean lag of the feet, or lag of the capture point, in steps, beyond which a step is repeated."""
 MIN_REAR_MARGIN, MAX_LEAD = 0.21, 0.04
 """Minimum distance by which the centre of mass of a walking body is in front of the rear edge of the support polygon of
 the standing body, relative to the height of the centre of mass; and maximum forward lean for maintaining this distance,
@@ -139,6 +139,8 @@ class Walk:
         """Indices of the feet that are being lifted, moved or set down."""
         self._sidestep = np.zeros(2)
         """(2,) m, offset of the swinging feet from their nominal footholds to catch the body."""
+        self._capture_error = np.zeros(2)
+        """(2,) m, capture point minus its plan at the last time step."""
         self._target_pressure: np.ndarray | None = None
         """(2,) m, target of the centre of pressure in the last time step."""
         self._late_swings = self._repeated_steps = 0
@@ -189,7 +191,9 @@ class Walk:
                 f"the body can make steps of {reached:.2f} at most"
             )
         if self._repeated_steps:
-            notes.append(f"the feet slipped: {self._repeated_steps} step{'s' * (self._repeated_steps > 1)} repeated")
+            notes.append(
+                f"the body fell behind: {self._repeated_steps} step{'s' * (self._repeated_steps > 1)} repeated"
+            )
         if self._late_swings:
             notes.append(f"{self._late_swings} swings took too long: a foot found no ground")
         return notes
@@ -256,12 +260,12 @@ class Walk:
             self._enter(WalkPhase.REST, time, local)
 
     def _plan_swing(self, swing: int, local: np.ndarray) -> None:
-        """Plan ``swing``, which starts with the nodes at ``local`` (N, 3). If the feet lag too far behind, a step is
-        repeated. A walk under commands (``motions.drive``) extends its route here."""
+        """Plan ``swing``, which starts with the nodes at ``local`` (N, 3). If the feet or the capture point lag too far
+        behind, a step is repeated. A walk under commands (``motions.drive``) extends its route here."""
         if (
             self._repeated_steps < self._requested_steps
-            and self._mean_lag(local) > MAX_LAG
             and swing < self.gait.step_count
+            and max(self._mean_lag(local), self._capture_lag(swing)) > MAX_LAG
         ):
             self.planar_poses = np.insert(self.planar_poses, swing + 1, self.planar_poses[swing], axis=0)
             self.gait = replace(self.gait, step_count=self.gait.step_count + 1)
@@ -273,6 +277,14 @@ class Walk:
             self._arrived_footholds
         )
         return float((self._foothold_error(local) * ahead).sum() / max((ahead**2).sum(), 1e-12))
+
+    def _capture_lag(self, swing: int) -> float:
+        """Return the lag of the capture point behind its plan in the direction of travel, in steps of ``swing``; a step
+        shorter than half of the longest one counts as half of it."""
+        step = (self.planar_poses[swing + 1] - self.planar_poses[swing])[:2]
+        length = float(np.linalg.norm(step))
+        unit = max(length, 0.5 * self._step_limits.length)
+        return float(-self._capture_error @ step) / max(length * unit, 1e-12)
 
     def _foothold_error(self, local: np.ndarray) -> np.ndarray:
         """Return the error (F, 2) in metres, nominal minus measured position, of each foot."""
@@ -408,7 +420,7 @@ class Walk:
         """
         com = self.body.centre_of_mass(local)
         pressure, divergent = self._plan.at(elapsed)
-        off = com[:2] + velocity[:2] / self._rate - divergent
+        off = self._capture_error = com[:2] + velocity[:2] / self._rate - divergent
         standing = [foot for foot in range(len(self.feet)) if foot not in self.swinging]
         under = self._planner.support(
             self._planner.current_footholds(local, self._footprints), standing, self.control.margin

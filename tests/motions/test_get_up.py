@@ -68,6 +68,25 @@ def test_the_body_rotates_about_the_edge_of_its_base() -> None:
     assert np.linalg.solve(body.inertia(state.positions), spin.target)[1] == pytest.approx(falls, rel=0.01)
 
 
+@pytest.mark.parametrize(("rate", "crouches"), [(1.0, True), (6.0, False)])
+def test_a_roll_without_enough_energy_crouches(rate: float, crouches: bool) -> None:
+    """In the free roll, a body that would not pass the top moves its centre of mass towards the edge and shortens; one
+    with enough energy rolls rigidly."""
+    get_up, lain = GetUp(block().place), lying(50.0)
+    get_up.phase, get_up._entered, body = GetUpPhase.ROLL, 0.0, get_up.body
+    edge = lain.positions[np.argmin(lain.positions @ [1.0, 0.0, 1.0])]
+    rolling = replace(lain, velocities=np.cross([0.0, -rate, 0.0], lain.positions - edge))
+    for step in range(8, 16):
+        com, _, nodes = get_up.objectives(replace(rolling, time=step * DT), None, DT)
+    assert isinstance(com, Objective) and isinstance(nodes, Objective)
+    arm = (body.centre_of_mass(lain.positions) - edge) * [1.0, 0.0, 1.0]
+    towards = -float(com.target @ arm) / np.linalg.norm(arm)
+    head = lain.positions[:, 2].argmax()
+    target = (nodes.target / body.mass_roots).reshape(-1, 3)[head] - com.target
+    outward = lain.positions[head] - body.centre_of_mass(lain.positions)
+    assert (towards > 0.1) == crouches and (target @ outward < -0.05) == crouches
+
+
 def test_a_try_learns_from_the_last_one() -> None:
     """The planned excess of energy is corrected by the measured one: upwards after the body has fallen back, downwards
     after it has fallen over the other side."""

@@ -164,6 +164,21 @@ def test_a_step_lost_to_slipping_is_repeated() -> None:
     assert np.array_equal(walk.planar_poses[2], before[1]) and "1 step" in walk.notes()[-1]
 
 
+@pytest.mark.parametrize(("lag", "repeats"), [(0.4, 0), (0.6, 1)])
+def test_a_step_is_repeated_if_the_capture_point_lags(lag: float, repeats: int) -> None:
+    """The lag is measured along the direction of travel, here to the left; an error across it does not count."""
+    place = coarse_creature(block_mesh(), forward=AHEAD, settle_first=False).place
+    walk = Walk(place, path_route(np.array([[0.0, 0.12]])), 0.04)
+    walk.planar_poses = np.array([[0.0, 0.0, 0.0], [0.0, 0.04, 0.0], [0.0, 0.08, 0.0], [0.0, 0.12, 0.0]])
+    walk.gait = replace(walk.gait, step_count=3)
+    walk._step_limits = replace(walk._step_limits, length=0.04)
+    walk._capture_error = np.array([-0.2, -lag * 0.04])
+    standing = place.ground.local(place.standing)
+    walk._arrived_footholds = [0, 0]
+    walk._plan_swing(1, standing)
+    assert walk._repeated_steps == repeats and walk.gait.step_count == 3 + repeats
+
+
 def test_the_plan_respects_the_limits_of_the_legs() -> None:
     place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, straight_route(0.24), 0.08)
